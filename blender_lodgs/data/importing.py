@@ -20,7 +20,7 @@ from ...training.methods import METHODS
 from ...training.scenes import overview
 from ...training.scenes.cameras import Camera, camera_extent
 from ...training.scenes.colmap import Scene, read_scene
-from ...training.scenes.formats import ensure_colmap_scene
+from ...training.scenes.formats import ensure_colmap_scene, scene_of_model
 from ...training.scenes.triangulate import cached_points
 from ...training.scenes.undistort import cached_undistorted_scene
 from ...training.scenes.view_tables import read_view_tables
@@ -74,7 +74,7 @@ def import_colmap(
     undistorted_cameras = {camera.name: camera for camera in undistorted.cameras} if undistorted else {}
     extent = scene.extent(default=1.0)
     near = scene.near(default=extent / 1000)
-    with new_scene(context, scene.folder.name) as root:
+    with new_scene(context, scene_of_model(scene.folder).name) as root:
         axes = axes_of(root)
         if upright:
             axes.rotation_quaternion = Matrix(scene.up_rotation().tolist()).to_quaternion()

@@ -279,6 +279,13 @@ def test_scene_without_points_shows_cameras_then_triangulated_points(bpy, lodgs,
     assert messages == [] and len(root.lodgs.points.data.points) == 50
 
 
+@pytest.mark.parametrize("model", ["sparse", "sparse/0"])
+def test_scene_of_a_chosen_model_has_the_name_of_its_folder(bpy, lodgs, tmp_path, model):
+    write_walls(tmp_path / "walls")
+    root = lodgs("data.importing").import_colmap(bpy.context, tmp_path / "walls" / model, warn=lambda _: None)
+    assert root.name == "walls" and len(lodgs("data.photographs").views(root)) == 6
+
+
 def _drop(bpy, path):
     """Drop a file into a 3D viewport, as a window does."""
     area = next(area for area in bpy.context.screen.areas if area.type == "VIEW_3D")

@@ -111,11 +111,15 @@ def scene_of_file(path: Path) -> tuple[Path, Path | None]:
             f"Cannot import {path}: its folder has neither a COLMAP model nor a known export.",
             f"Choose a file of a COLMAP model, such as cameras.bin, or of an export of {FORMAT_NAMES}.",
         )
+    folder = scene_of_model(model)
+    return folder, model if len(find_models(folder)) > 1 else None
+
+
+def scene_of_model(folder: Path) -> Path:
+    """Return the folder that contains ``sparse`` or ``sparse/0``, or another folder itself."""
     if folder.name.isdigit() and folder.parent.name == "sparse":
         folder = folder.parent
-    if folder.name == "sparse":
-        folder = folder.parent
-    return folder, model if len(find_models(folder)) > 1 else None
+    return folder.parent if folder.name == "sparse" else folder
 
 
 def ensure_colmap_scene(folder: Path, warn: Callable[[str], object]) -> Path:
