@@ -277,8 +277,8 @@ class _TrainingRun:
     def run(self, received: list[int]) -> bool:
         """Train all remaining steps; save and return False on a stop signal or a cancel request."""
         method = self.method
-        self._started, self._started_step = time.monotonic(), self.step
-        last_checkpoint = last_progress = self._started
+        begin = last_checkpoint = last_progress = time.monotonic()
+        self._started, self._started_step = begin, self.step
         while not self._stopped(received):
             if self.step == method.steps:
                 return True
@@ -287,7 +287,7 @@ class _TrainingRun:
             levels = method.levels_after(self.step)
             self.step += 1
             now = time.monotonic()
-            interval = min(max(PROGRESS_SECONDS[0], (now - self._started) / 1000), PROGRESS_SECONDS[1])
+            interval = min(max(PROGRESS_SECONDS[0], (now - begin) / 1000), PROGRESS_SECONDS[1])
             if now - last_progress >= interval or self.step == method.steps:
                 require_finite(loss, self.step)
                 quality = psnr(image().cpu(), target.image.cpu(), target.mask)

@@ -130,6 +130,27 @@ def test_time_left_follows_the_speed_of_the_last_steps(monkeypatch):
     assert [left[step] for step in (50, 60, 80)] == [150, 120, 60]
 
 
+def test_long_runs_report_progress_less_often(monkeypatch):
+    """After 500 s, events are at least a thousandth of the elapsed time apart: at most 1000 (1 + ln 6)."""
+    now, events, pixels = 0.0, [], torch.zeros(1, 1, 3)
+    monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: now))
+    run = object.__new__(training_loop._TrainingRun)
+
+    def train_step(step):
+        nonlocal now
+        now += 0.5
+        return lambda: 0.1, lambda: pixels, SimpleNamespace(image=pixels, mask=None)
+
+    run.method = SimpleNamespace(
+        steps=6000, levels=1, splats=5, stage=lambda step: "", level_at=lambda step: 1,
+        levels_after=lambda step: [], train_step=train_step,
+    )  # fmt: skip
+    run.events = lambda kind, **values: events.append(values["step"])
+    run.step, run._stopped, run._save = 0, lambda received: False, lambda: None
+    assert run.run([])
+    assert 2000 < len(events) <= 1000 * (1 + np.log(6)) and events[-1] == 6000
+
+
 def test_run_without_held_out_views_measures_training_views(tiny_scene, tmp_path):
     keys = {
         "scene": str(tiny_scene), "out": str(tmp_path / "run"), "image_scale": 1.0, "test_every": 0,
