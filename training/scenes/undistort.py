@@ -85,7 +85,7 @@ def _read_cached(target: Path, scene: Scene) -> Scene:
     return replace(
         result, cameras=cameras, names=scene.names, points=scene.points, point_colors=scene.point_colors,
         point_ids=scene.point_ids, point_model=scene.point_model or scene.model,
-        warnings=[*scene.warnings, *warnings],
+        georeference=scene.georeference, warnings=[*scene.warnings, *warnings],
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from training.scenes import pycolmap_process
 from training.scenes.colmap import read_scene
 from training.scenes.images import load_image
 from training.scenes.undistort import undistort_scene
+from training.splats.georeference import Georeference, write_georeference
 
 
 def ramps() -> np.ndarray:
@@ -138,6 +139,13 @@ def test_cache_depends_on_content(tmp_path, monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", None)  # makes any call fail
     assert undistort_scene(read_scene(tmp_path), cache).cameras[0].image == second.cameras[0].image
+
+
+def test_place_on_earth_stays_the_same(tmp_path):
+    synthetic.write_scene(tmp_path, synthetic.camera("RADIAL"))
+    write_georeference(tmp_path, Georeference("EPSG:32631", np.diag([2.0, 2.0, 2.0, 1.0])))
+    scene = read_scene(tmp_path)
+    assert undistort_scene(scene, tmp_path / "cache").georeference is scene.georeference is not None
 
 
 def test_pinhole_scene_is_returned_unchanged(tmp_path):
