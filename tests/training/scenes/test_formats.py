@@ -265,6 +265,16 @@ def test_output_folder_gets_links_and_source_stays_unchanged(tmp_path):
         convert_export(source, out)
 
 
+@pytest.mark.parametrize("in_place", [False, True])
+def test_place_on_earth_beside_an_export_is_kept(tmp_path, in_place):
+    source, out = tmp_path / "source", tmp_path / "out"
+    write_transforms(source)
+    (source / "map.prj").write_text('PROJCS["WGS 84 / UTM zone 31N"]')
+    convert_export(source, None if in_place else out)
+    place = read_scene(source if in_place else out).georeference
+    assert place is not None and place.crs.startswith("PROJCS")
+
+
 def test_masks_are_linked(tmp_path):
     def change(document):
         document["frames"][1]["mask_path"] = "black/b.png"

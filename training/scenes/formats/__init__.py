@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
 from ...errors import LodgsError, SystemProblem, system_reason, system_remedy
 from ...files import check_folder, is_file, link_or_copy, temporary_folder
-from ...splats.georeference import write_georeference
+from ...splats.georeference import read_georeference, write_georeference
 from ..colmap import (
     DEPTHS,
     MASKS,
@@ -180,6 +180,8 @@ def convert_export(
         warnings.append(
             f"{len(missing)} masks are missing, such as {missing[0]}. Their photos are not masked."
         )
+    if out is not None and exported.georeference is None:
+        exported = replace(exported, georeference=read_georeference(folder, warnings.append))
     count = len(exported.points)
     if not count and all(view.has_depth for view in views):
         warnings.append(f"{name} has no points. Training creates them from the depth maps.")
