@@ -42,8 +42,8 @@ from .ply import (
 
 ORDERS = ("finest_first", "stream")
 """Orders of the levels in a file: finest or coarsest level first."""
-# Some viewers read no further than 10 KB to find the end of the header.
-_MAX_COMMENTS = 2560
+# Some viewers read no further than 10 KB to find the end of the header. Usual descriptions take 1 to 3 KB.
+_MAX_COMMENTS = 5120
 
 RowSelector = Callable[[Bundle], Mapping[int, np.ndarray]]
 """Returns the rows (M,) of each level to read, by level number, for a bundle with its tables but without

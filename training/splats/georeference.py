@@ -21,6 +21,8 @@ FILE = "georeference.json"
 """File of a scene's folder with the values of :meth:`Georeference.to_json`."""
 _MAX_TEXT = 8192
 """Maximum length of a WKT text."""
+_MAX_STORED = 1536
+"""Maximum bytes of the system of a scene, as JSON: it must fit into the header of a bundle."""
 _SURFACE = 6.2e6, 6.6e6
 """Distances in metres from the Earth's centre between which a position counts as geocentric."""
 
@@ -79,7 +81,7 @@ def read_georeference(folder: Path, warn: Callable[[str], object]) -> Georeferen
     """Return the georeference of a scene's folder, from georeference.json or a .prj file with WKT.
 
     Args:
-        warn: receives a sentence about a damaged file, which counts as none.
+        warn: receives a sentence about a damaged or too long file, which counts as none.
     """
     path = folder / FILE
     try:
@@ -89,7 +91,12 @@ def read_georeference(folder: Path, warn: Callable[[str], object]) -> Georeferen
         path = projections[0] if projections else path
         text = decode_text(read_bytes(path, 2 * _MAX_TEXT))
         values = {"crs": text} if projections else parse_json(text, FILE, 2 * _MAX_TEXT)
-        return Georeference.from_json(values)
+        place = Georeference.from_json(values)
+        if (size := len(json.dumps(place.crs))) > _MAX_STORED:
+            raise ValueError(
+                f"its system takes {size:,} bytes, more than {_MAX_STORED:,}. Write its EPSG code to {FILE}"
+            )
+        return place
     except (LodgsError, OSError, ValueError) as error:
         reason = error.what if isinstance(error, LodgsError) else f"{error}."
         warn(f"Ignored the place on Earth in {path}: {reason}")

@@ -22,7 +22,7 @@ from training.splats.georeference import (
     local_tangent_plane,
     write_georeference,
 )
-from training.splats.levels import Bundle, Level
+from training.splats.levels import MAX_LEVELS, Bundle, Level
 from training.splats.ply import write_ply
 from training.splats.portable_levels import PortableLevels
 from training.splats.similarity import Similarity
@@ -71,6 +71,24 @@ def test_damaged_file_is_a_warning_of_the_scene(tiny_scene, tmp_path):
     data = TrainingData(read_scene(copy), test_every=4)
     method = create("3dgs", data, resolve_parameters("3dgs", "draft", {"steps": 2}), 0, "cpu")
     assert Bundle("", [], meta=method.meta()).georeference.matrix[0, 0] == 2
+
+
+def test_every_system_of_a_scene_fits_into_the_header(tiny_scene, tmp_path):
+    """Costs of LODGE's levels, the most levels of a job and the longest system are in one header."""
+    for entry in tiny_scene.iterdir():
+        (tmp_path / entry.name).symlink_to(entry)
+    (tmp_path / "site.prj").write_text(f'COMPD_CS["{"x" * 1521}"]')
+    assert read_scene(tmp_path).georeference is None
+    assert any("takes 1,537 bytes" in warning for warning in read_scene(tmp_path).warnings)
+    (tmp_path / "site.prj").write_text(f'COMPD_CS["{"x" * 1520}"]')
+    place = read_scene(tmp_path).georeference
+    assert place is not None
+    costs = [{"level": n, "distances": [12.34] * 9, "costs": [123.4] * 9, "before": 123.4} for n in range(4)]
+    turned = Similarity.from_angles((10, 20, 30), 1.1, (1 / 3, 2 / 3, 3)).matrix
+    meta = {"view": turned[:2, :3].tolist(), "up_rotation": turned[:3, :3].tolist(), "costs": costs}
+    meta["georeference"] = place.after(turned).to_json()
+    levels = [Level(n, random_splats(2), {"d_l": n / 7}) for n in range(1, MAX_LEVELS + 1)]
+    write_bundle(tmp_path / "bundle.ply", Bundle("lodge", levels, "chunks", meta=meta))
 
 
 @pytest.fixture
