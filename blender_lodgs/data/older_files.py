@@ -1,4 +1,4 @@
-"""Upgrade of files saved by older versions, and repair of damaged ones."""
+"""Upgrade of files saved by older versions or opened without the extension, and repair of damaged ones."""
 
 from __future__ import annotations
 
@@ -67,14 +67,31 @@ def _on_load(*_) -> None:
             upgrade_scene(obj)
 
 
+def _restore_drivers() -> None:
+    """Let Blender evaluate the drivers that were invalid without the extension's properties."""
+    for obj in bpy.data.objects:
+        for curve in obj.animation_data.drivers if obj.animation_data else ():
+            if not curve.driver.is_valid:
+                curve.driver.expression = curve.driver.expression  # setting it clears the error
+
+
+def _upgrade_open_file() -> None:
+    """Upgrade the file that was opened before the extension was enabled."""
+    _on_load()
+    _restore_drivers()
+
+
 _HANDLERS = (bpy.app.handlers.load_post, bpy.app.handlers.blend_import_post)
 
 
 def register() -> None:
     for handlers in _HANDLERS:
         handlers.append(_on_load)
+    bpy.app.timers.register(_upgrade_open_file, first_interval=0)  # data are not accessible yet
 
 
 def unregister() -> None:
     for handlers in _HANDLERS:
         handlers.remove(_on_load)
+    if bpy.app.timers.is_registered(_upgrade_open_file):
+        bpy.app.timers.unregister(_upgrade_open_file)

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from tests.blender.fake_trainer import splats
+from tools.blender_module import EXTENSION
 from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
 
@@ -50,3 +51,30 @@ def test_finest_level_appears_as_points(bpy, lodgs, tmp_path, cumulative):
         f"b level {number}": count for number, count in expected.items()
     }
     assert all(radius > 0 and not hidden for _, radius, hidden in clouds.values())
+
+
+def test_enabling_the_extension_restores_the_open_file(bpy, lodgs, tmp_path):
+    """Drivers that were evaluated without their properties stay invalid in Blender until they are edited."""
+    import addon_utils
+
+    levels = [Level(number, splats(count), {"s_min": 0.1 / number}) for number, count in COUNTS.items()]
+    write_bundle(tmp_path / "b.ply", Bundle("made", levels, "bands"))
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
+    addon_utils.disable(EXTENSION)
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
+        bpy.context.view_layer.update()
+    finally:
+        addon_utils.enable(EXTENSION)
+    older_files = lodgs("data.older_files")
+    assert bpy.app.timers.is_registered(older_files._upgrade_open_file)  # timers do not run in background
+    older_files._upgrade_open_file()
+    root, level = bpy.data.objects["b"], bpy.data.objects["b level 2"]
+    root.lodgs.mode = "SELECTIVE"
+    bpy.context.view_layer.update()
+    assert level.visible_get() and level.modifiers["LODGS Bands"].show_viewport
+    root.lodgs.mode, root.lodgs.single_level = "SINGLE", 1
+    bpy.context.view_layer.update()
+    assert not level.visible_get() and not level.modifiers["LODGS Bands"].show_viewport
+    assert all(curve.driver.is_valid for obj in (root, level) for curve in obj.animation_data.drivers)
