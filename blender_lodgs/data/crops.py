@@ -17,6 +17,7 @@ from .. import compat
 from ..attributes import HIDDEN
 from ..nodes import crops as groups
 from ..nodes.building import add_modifier, find_modifier, remove_modifier, replace_driver
+from .objects import root_of
 from .placement import axes_of
 
 DISPLAY_TYPES = {"BOX": "CUBE", "SPHERE": "SPHERE"}
@@ -24,8 +25,8 @@ DISPLAY_TYPES = {"BOX": "CUBE", "SPHERE": "SPHERE"}
 
 
 def crops_of(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the crops under a root, sorted by name."""
-    candidates = [obj for obj in bpy.data.objects if obj.lodgs_crop.is_crop and _is_under(obj, root)]
+    """Return the crops of a scene, sorted by name; those of scenes below its root are not among them."""
+    candidates = [obj for obj in bpy.data.objects if obj.lodgs_crop.is_crop and root_of(obj) == root]
     return sorted((obj for obj in candidates if obj.users_collection), key=lambda obj: obj.name)
 
 
@@ -149,12 +150,6 @@ def followed_objects(obj: bpy.types.Object, count_key: str = groups.COUNT) -> li
 def detach(obj: bpy.types.Object) -> None:
     """Remove the crop modifier of a level or of a copy of one."""
     remove_modifier(obj, modifier_of(obj))
-
-
-def _is_under(obj: bpy.types.Object | None, root: bpy.types.Object) -> bool:
-    while obj is not None and obj != root:
-        obj = obj.parent
-    return obj is not None
 
 
 def _crop(

@@ -213,6 +213,17 @@ def test_modifiers_follow_changed_and_deleted_crops(bpy, lodgs, scene_of):
     assert not any(group.users for group in bpy.data.node_groups if group.name.startswith("LODGS Clean Up"))
 
 
+def test_crop_of_a_child_scene_leaves_its_parent_scene_uncropped(bpy, lodgs, scene_of):
+    house, garden = (scene_of(bundle_of("bands", np.random.default_rng(seed)))[0] for seed in (1, 2))
+    garden.parent = house
+    bpy.context.view_layer.update()
+    crop = lodgs("operators.clean_up").add_crop(bpy.context, garden, "BOX")
+    bpy.context.view_layer.update()
+    crops = lodgs("data.crops")
+    assert crops.crops_of(garden) == [crop] and crops.crops_of(house) == []
+    assert crops.modifier_of(house.lodgs.levels[0].object) is None
+
+
 def test_clean_up_tests_hide_matching_splats(bpy, lodgs, scene_of):
     bundle = bundle_of("bands", np.random.default_rng(3))
     planted = (np.float32([40, 0, 0]) + np.random.default_rng(0).normal(0, 0.01, (3, 3))).astype(np.float32)
