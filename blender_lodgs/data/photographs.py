@@ -18,7 +18,7 @@ from ...training.splats.dialects import Warn, ignore
 from ..attributes import HIDDEN, read_attribute
 from . import crops, selection
 from .objects import root_of
-from .placement import matrix_in_parent
+from .placement import matrix_in_world
 
 SENSOR = 36.0
 """Longer side of imported cameras' sensors in millimetres, as on a full-frame camera."""
@@ -271,14 +271,14 @@ def _blocking_meshes(context: bpy.types.Context, position: Vector, target: Vecto
 
 
 def photo_viewpoint(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
-    """Return a camera position and its target, in the space of the root's parent.
+    """Return a camera position and its target, in Blender's world.
 
     They come from the bundle, or from the most central view and the median depth of the points. None without
     both.
     """
     meta = selection.read_json(root.lodgs.meta)
     if "view" in meta:
-        position, target = (matrix_in_parent(root) @ Vector(point) for point in meta["view"])
+        position, target = (matrix_in_world(root) @ Vector(point) for point in meta["view"])
         return position, target
     poses, points = np.array([view.matrix_basis for view in views(root)]), _positions(root.lodgs.points)
     if not len(poses) or not len(points):
@@ -288,13 +288,13 @@ def photo_viewpoint(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
     position, direction = pose[:3, 3], -pose[:3, 2]
     depths = (points - position) @ direction
     depth = np.median(depths[depths > 0]) if (depths > 0).any() else 1.0
-    return matrix_in_parent(root) @ Vector(position), matrix_in_parent(root) @ Vector(
+    return matrix_in_world(root) @ Vector(position), matrix_in_world(root) @ Vector(
         position + depth * direction
     )
 
 
 def central_bounds(root: bpy.types.Object) -> tuple[Vector, float] | None:
-    """Return center and diagonal of a box around most of a scene, in the space of the root's parent.
+    """Return center and diagonal of a box around most of a scene, in Blender's world.
 
     The box encloses nine tenths of the remaining finest level along each axis, or of the points, without
     far background and outliers. None if the scene has neither.
@@ -304,8 +304,8 @@ def central_bounds(root: bpy.types.Object) -> tuple[Vector, float] | None:
         return None
     points = points[:: max(len(points) // 100_000, 1)].astype(np.float64)
     low, high = np.percentile(points[overview.is_near(points)], (5, 95), axis=0)
-    size = float(np.linalg.norm(high - low)) * max(matrix_in_parent(root).to_scale())
-    return matrix_in_parent(root) @ Vector((low + high) / 2), size
+    size = float(np.linalg.norm(high - low)) * max(matrix_in_world(root).to_scale())
+    return matrix_in_world(root) @ Vector((low + high) / 2), size
 
 
 def _reach(root: bpy.types.Object) -> float:
@@ -318,7 +318,7 @@ def _reach(root: bpy.types.Object) -> float:
     if bounds is None:
         return 0.0
     across = float(np.linalg.norm(np.ptp(_central_points(root), axis=0))) * max(
-        matrix_in_parent(root).to_scale()
+        matrix_in_world(root).to_scale()
     )
     return min(across, 100 * bounds[1])
 

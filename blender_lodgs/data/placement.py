@@ -46,12 +46,14 @@ def lock_transform(obj: bpy.types.Object) -> None:
     obj.lock_rotation_w = obj.lock_rotations_4d = True
 
 
-def matrix_in_parent(root: bpy.types.Object) -> Matrix:
-    """Return the matrix from a splat scene's coordinates to the space of the root's parent.
+def matrix_in_world(root: bpy.types.Object) -> Matrix:
+    """Return the matrix from a splat scene's coordinates to Blender's world.
 
-    It is valid before Blender evaluates the objects. The parent's space is usually the world.
+    It is valid before Blender evaluates the objects of a root without parent, such as a new one.
     """
     axes = axes_of(root)
+    if root.parent is not None:
+        return axes.matrix_world.copy()
     root_matrix = root.matrix_basis
     return (
         root_matrix.copy() if axes == root else root_matrix @ axes.matrix_parent_inverse @ axes.matrix_basis

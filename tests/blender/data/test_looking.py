@@ -42,8 +42,14 @@ def test_framing_ignores_outliers(bpy, lodgs, tmp_path):
     center, size = lodgs("data.photographs").central_bounds(root)
     np.testing.assert_allclose(center, (20, 40, 65), atol=0.3)
     assert size == pytest.approx(2 * 2 * 0.9 * 3**0.5, rel=0.1)
-    empty = bpy.data.objects.new("nothing", None)
-    assert lodgs("data.photographs").central_bounds(empty) is None
+    parent = bpy.data.objects.new("parent", None)
+    bpy.context.scene.collection.objects.link(parent)
+    assert lodgs("data.photographs").central_bounds(parent) is None
+    root.parent, parent.location, parent.scale = parent, (100, 0, 0), (3, 3, 3)
+    bpy.context.view_layer.update()
+    moved_center, moved_size = lodgs("data.photographs").central_bounds(root)
+    np.testing.assert_allclose(moved_center, (160, 120, 195), atol=1)
+    assert moved_size == pytest.approx(3 * size, rel=1e-5)
 
 
 def test_framing_ignores_the_far_background(bpy, lodgs, tmp_path):
