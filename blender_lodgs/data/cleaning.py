@@ -24,6 +24,7 @@ from ...training.splats.levels import Bundle
 from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_attribute, write_attribute
 from . import changes, crops, photographs, selection
 from .cameras import UnsupportedCameraError, view_from
+from .objects import root_of
 from .placement import axes_of
 
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
@@ -291,7 +292,7 @@ def visible_opacities(cloud: bpy.types.PointCloud, means: np.ndarray, query: Lod
 
 
 def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
-    """Return the cameras of a scene, or of the Blender scene if it has none, in the splats' space.
+    """Return the cameras of a scene in the splats' space; those of no splat scene if it has none.
 
     Raises:
         LodgsError: there are no cameras, or the root is scaled differently along its axes.
@@ -300,8 +301,9 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
     width, height = (context.scene.render.resolution_x, context.scene.render.resolution_y)
     depsgraph = context.evaluated_depsgraph_get()
     result = []
-    for view in views or [obj for obj in context.scene.objects if obj.type == "CAMERA"]:
-        if view.data.lodgs.width:
+    others = [obj for obj in context.scene.objects if obj.type == "CAMERA" and root_of(obj) in (None, root)]
+    for view in views or others:
+        if views and view.data.lodgs.width:
             # Blender does not evaluate hidden views; their own pose is always valid.
             result.append(photographs.camera_of(view))
             continue

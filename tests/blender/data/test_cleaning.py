@@ -392,6 +392,20 @@ def test_selected_splats_are_hidden_and_matches_selected(bpy, lodgs, scene_of):
         np.testing.assert_array_equal(cleaning.hidden_mask(item.object.data), expected)
 
 
+def test_cameras_of_other_splat_scenes_are_not_used(bpy, lodgs, scene_of):
+    """Their photos see other splats, and their poses are in the space of another scene."""
+    root, _ = scene_of(bundle_of("bands", np.random.default_rng(1)))
+    lodgs("data.importing").import_colmap(bpy.context, GARDEN, photographs=False)
+    with pytest.raises(lodgs("training.errors").LodgsError, match="has no cameras"):
+        lodgs("data.cleaning").cameras(bpy.context, root)
+    camera = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
+    camera.data.lodgs.width, camera.location = 100, (3, 2, 1)  # a copy of a photo's camera
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.view_layer.update()
+    (view,) = lodgs("data.cleaning").cameras(bpy.context, root)
+    np.testing.assert_allclose(ROOT_MATRIX @ (*view.center, 1), (3, 2, 1, 1), atol=1e-5)
+
+
 def test_views_of_photographs_are_the_cameras(bpy, lodgs):
     from training.scenes.colmap import read_scene
 
