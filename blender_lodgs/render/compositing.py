@@ -84,7 +84,8 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
         meshes.render.engine = mesh_engine
         meshes.cycles.samples = SAMPLES
-        scene.lodgs_render.before_meshes = json.dumps(previous)
+        if not scene.lodgs_render.before_meshes:  # set if the user deleted the second scene
+            scene.lodgs_render.before_meshes = json.dumps(previous)
     engine.use(scene)
     meshes.lodgs_render.is_for_meshes = True
     for rendered in (scene, meshes):

@@ -71,6 +71,7 @@ def test_nodes_of_the_user_are_not_removed(bpy, lodgs, scene):
 
 
 def test_combining_works_again_after_deleting_the_mesh_scene(bpy, lodgs, scene):
+    scene.view_layers[0].use_pass_z = False
     assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
     bpy.data.scenes.remove(scene.lodgs_render.meshes)
     assert scene.lodgs_render.meshes is None
@@ -79,6 +80,8 @@ def test_combining_works_again_after_deleting_the_mesh_scene(bpy, lodgs, scene):
         n for n in lodgs("compat").compositor_tree(scene).nodes if n.bl_idname == "CompositorNodeRLayers"
     ]
     assert {node.scene for node in layers} == {scene, scene.lodgs_render.meshes}
+    assert bpy.ops.lodgs.separate_meshes() == {"FINISHED"}
+    assert not scene.render.film_transparent and not scene.view_layers[0].use_pass_z
 
 
 def test_mesh_scene_copies_markers_and_excluded_collections(bpy, lodgs, scene):
