@@ -22,7 +22,7 @@ _COPIED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
     "use_border", "use_crop_to_border", "border_min_x", "border_max_x", "border_min_y", "border_max_y",
     "fps", "fps_base", "use_multiview", "views_format", "use_motion_blur", "motion_blur_shutter",
-    "motion_blur_position",
+    "motion_blur_position", "frame_map_old", "frame_map_new",
 )  # fmt: skip
 
 

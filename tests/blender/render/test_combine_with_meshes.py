@@ -94,8 +94,10 @@ def test_mesh_scene_copies_markers_and_excluded_collections(bpy, lodgs, scene):
     layer = scene.view_layers[0].layer_collection.children
     layer["hidden"].exclude = True
     layer["indirect"].indirect_only = True
+    scene.render.frame_map_new = 200
     bpy.ops.lodgs.combine_with_meshes()
     meshes = scene.lodgs_render.meshes
+    assert meshes.render.frame_map_new == 200
     assert {marker.frame: marker.camera for marker in meshes.timeline_markers} == {
         1: cameras[0],
         10: cameras[1],
