@@ -213,6 +213,7 @@ def _exclude_collections(
         for root in roots.roots(scene)
         for obj in (root, *(item.object for item in root.lodgs.existing_levels))
         for collection in obj.users_collection
+        if not _has_meshes(collection)
     }
     scene.view_layers[0].update()  # creates the layer collections of new collections
     visible = {item.collection: item for item in _included(scene.view_layers[0].layer_collection)}
@@ -230,6 +231,15 @@ def _exclude_collections(
             original = visible[item.collection]
             item.holdout = original.holdout
             item.indirect_only = original.indirect_only or item.collection in splat_collections
+
+
+def _has_meshes(collection: bpy.types.Collection) -> bool:
+    """Return whether a collection of a splat scene, or one below it, has rendered objects of the user."""
+    return any(
+        obj.instance_type == "COLLECTION" or obj.type not in ("EMPTY", "CAMERA", "POINTCLOUD")
+        for obj in collection.all_objects
+        if not obj.hide_render
+    )
 
 
 def _has_only_catchers(collection: bpy.types.Collection) -> bool:

@@ -117,6 +117,19 @@ def test_splats_of_a_moved_root_are_excluded_from_the_mesh_scene(bpy, lodgs, sce
     assert copied[collection.name].children[splats.name].exclude
 
 
+@pytest.mark.parametrize("shadows", [False, True])
+def test_mesh_in_the_collection_of_a_splat_scene_is_rendered(bpy, lodgs, scene, shadows):
+    [root] = lodgs("data.roots").roots(scene)
+    collection, splats = lodgs("data.roots").collection_of(root), lodgs("data.roots").levels_collection(root)
+    collection.objects.link(bpy.data.objects.new("mesh", bpy.data.meshes.new("mesh")))
+    scene.lodgs_render.shadows = shadows
+    bpy.ops.lodgs.combine_with_meshes()
+    meshes = scene.lodgs_render.meshes.view_layers[0]
+    copied = meshes.layer_collection.children[collection.name]
+    assert not copied.exclude and not copied.indirect_only
+    assert copied.children[splats.name].exclude != shadows and "mesh" in meshes.objects
+
+
 @pytest.mark.parametrize("name", ["collection_of", "levels_collection"])
 def test_instances_of_splats_are_no_meshes(bpy, lodgs, scene, name):
     """Cycles would draw them as points. The original scene still renders them with any engine."""
