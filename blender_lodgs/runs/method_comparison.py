@@ -8,6 +8,7 @@ from collections.abc import Collection
 import bpy
 
 from ...training.errors import LodgsError
+from .. import extension
 from ..data.paths import absolute_path
 from . import environment, run_folders
 from .program_sequence import ProgramSequence
@@ -45,7 +46,7 @@ def compare_methods(root: bpy.types.Object, methods: Collection[str]) -> Program
     folder = run_folders.runs_parent(root) / "comparison" / bpy.path.clean_name(root.name)
     command = [str(python), "-m", "training", "compare", str(absolute_path(root.lodgs.scene_folder))]
     command += ["--out", str(folder), "--methods", *methods, "--preset", settings.preset]
-    command += [f"--image-scale={settings.image_scale:.6g}"]
+    command += [f"--image-scale={settings.image_scale:.6g}", "--backend", extension.preferences().backend]
     page = folder / "index.html"
 
     def finish(work: ProgramSequence) -> None:
@@ -58,7 +59,7 @@ def compare_methods(root: bpy.types.Object, methods: Collection[str]) -> Program
         current = ProgramSequence(folder / "compare.log", [command], finish, "Comparing methods")
     except OSError as error:
         raise LodgsError(
-            f"Cannot write to {folder}: {error.strerror or error}.", "Choose another Output folder."
+            f"Cannot write to {folder}: {error.strerror or error}.", "Choose another Runs Folder."
         ) from error
     current.root = root
     return current

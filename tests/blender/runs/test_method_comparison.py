@@ -41,10 +41,12 @@ def test_methods_train_with_the_settings_of_the_panel(bpy, lodgs, root, trainer,
     trainer("Training FLoD (1 of 1), step 30 of 40")
     root.lodgs.training.output = str(tmp_path / "runs")
     root.lodgs.training.image_scale = 0.25
+    lodgs("extension").preferences().backend = "cpu"
     assert bpy.ops.lodgs.compare_methods(methods={"flod", "clod"}) == {"FINISHED"}
     words = (tmp_path / "arguments").read_text().split()
     assert words[:3] == ["-m", "training", "compare"]
     assert words[words.index("--methods") + 1 :][:2] == ["flod", "clod"]
+    assert words[words.index("--backend") + 1] == "cpu"
     assert "--image-scale=0.25" in words and words[words.index("--preset") + 1] == "draft"
     page = tmp_path / "runs" / "comparison" / bpy.path.clean_name(root.name) / "index.html"
     assert lodgs("runs.method_comparison").current.message.endswith(str(page))
