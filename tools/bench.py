@@ -422,6 +422,15 @@ def plot(cases: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def read_results(path: str) -> dict:
+    """Read the results of an earlier run, for argparse."""
+    try:
+        results = json.loads(Path(path).read_text(encoding="utf-8"))
+        return {"cases": results["cases"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise argparse.ArgumentTypeError(f"{path} is not the bench.json of an earlier run") from error
+
+
 def compare(new: dict, base: dict) -> None:
     """Print the step time of each case relative to an earlier run."""
     earlier = {(case["splats"], case["width"], case["height"]): case for case in base["cases"]}
@@ -435,7 +444,7 @@ def compare(new: dict, base: dict) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3.0, help="time limit per case")
-    parser.add_argument("--base", type=Path, help="earlier bench.json to compare with")
+    parser.add_argument("--base", type=read_results, help="earlier bench.json to compare with")
     parser.add_argument("--out", type=Path, default=Path("build/bench/bench.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -446,7 +455,7 @@ def main() -> None:
     options.out.write_text(json.dumps(result, indent=1) + "\n")
     print(f"saved {options.out}")
     if options.base:
-        compare(result, json.loads(options.base.read_text()))
+        compare(result, options.base)
 
 
 if __name__ == "__main__":
