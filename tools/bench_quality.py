@@ -126,8 +126,8 @@ def train(
     environment = os.environ | {"PYTHONPATH": "", "OMP_NUM_THREADS": "1"}
     process = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
     if process.returncode:
-        last = process.stdout.strip().splitlines()[-1:] or [process.stderr]
-        raise LodgsError(f"Cannot train {method} on {scene.name} with {checkout}: {last[0]}")
+        output = process.stdout.strip() or process.stderr.strip() or "no output"
+        raise LodgsError(f"Cannot train {method} on {scene.name} with {checkout}: {output.splitlines()[-1]}")
 
 
 def _version(checkout: Path) -> str:
@@ -281,7 +281,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.base and not args.report:
         parser.error("--base requires --report: older versions may not support validation views")
     versions = {"this": HERE} | ({"base": args.base.resolve()} if args.base else {})
-    if args.base and not (args.base / "training").is_dir():
+    if args.base and not (args.base / "training" / "__main__.py").is_file():
         parser.error(f"--base {args.base} is not a checkout of the project")
     if not all(0 < share <= 10 for share in args.shares):
         parser.error("--shares must be above 0 and at most 10")

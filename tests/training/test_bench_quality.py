@@ -69,6 +69,12 @@ def test_comparison_with_another_checkout_requires_test_views(tiny_scene, tmp_pa
     assert "--base requires --report" in capsys.readouterr().err
 
 
+def test_folder_without_the_trainer_is_rejected(tiny_scene, tmp_path, capsys):
+    (tmp_path / "training").mkdir()
+    assert bench(tiny_scene, "--report", "--base", tmp_path) == 2
+    assert f"{tmp_path} is not a checkout" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_error_of_the_trainer_is_reported(tmp_path, capsys):
@@ -118,3 +124,12 @@ def test_share_scales_all_steps(monkeypatch, tmp_path):
         f"--set=tune_steps={lodge.tune_steps // 2}",
         f"--set=steps={[steps // 2 for steps in flod.steps]}",
     ]
+
+
+def test_failed_import_of_a_checkout_is_reported_in_a_line(monkeypatch, tmp_path):
+    error = "Traceback (most recent call last):\n  ...\nModuleNotFoundError: No module named 'gsplat'\n"
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 1, "", error))
+    args = SimpleNamespace(preset="draft", image_scale=1.0, set=[], report=True)
+    with pytest.raises(LodgsError, match="No module named 'gsplat'") as raised:
+        bench_quality.train(tmp_path, tmp_path / "out", tmp_path, "3dgs", 0.5, 0, args)
+    assert "Traceback" not in str(raised.value)
