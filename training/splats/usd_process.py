@@ -96,7 +96,7 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     if count > MAX_READ_LEVELS:
         raise LodgsError(f"Cannot read {path}: it has {count} levels.", "Export fewer levels.")
     cache = usd.UsdGeom.XformCache(usd.Usd.TimeCode.EarliestTime())
-    unit = usd.UsdGeom.GetStageMetersPerUnit(stage) if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1
+    unit = _metres_per_unit(usd, stage)
     metres = np.diag([unit] * 3 + [1.0])
     items = [*fields, *(prim for group in groups.values() for prim in group)]
     matrices = [metres @ np.array(cache.GetLocalToWorldTransform(prim)).T for prim in items]
@@ -140,6 +140,12 @@ def _is_shown(usd: SimpleNamespace, prim) -> bool:
     imageable, tokens = usd.UsdGeom.Imageable(prim), usd.UsdGeom.Tokens
     hidden = imageable.ComputeVisibility(usd.Usd.TimeCode.EarliestTime()) == tokens.invisible
     return not hidden and imageable.ComputePurpose() not in (tokens.proxy, tokens.guide)
+
+
+def _metres_per_unit(usd: SimpleNamespace, stage) -> float:
+    """Return the unit of a stage in metres; 1 if none is stored, or one that is no length."""
+    unit = usd.UsdGeom.GetStageMetersPerUnit(stage)
+    return unit if usd.UsdGeom.StageHasAuthoredMetersPerUnit(stage) and 0 < unit < np.inf else 1.0
 
 
 def _open(usd: SimpleNamespace, path: Path):

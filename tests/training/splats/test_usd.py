@@ -250,6 +250,14 @@ def test_units_are_converted_to_metres(tmp_path):
     np.testing.assert_allclose(np.exp(splats.log_scales[0]), [0.001, 0.002, 0.003], rtol=1e-5)
 
 
+@pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf")])
+def test_units_without_a_length_are_ignored(tmp_path, unit):
+    stage = foreign(tmp_path)
+    stage.SetMetadata("metersPerUnit", unit)
+    stage.GetRootLayer().Save()
+    np.testing.assert_array_equal(read(tmp_path / "b.usdc").levels[0].splats.means[0], [0, 1, 0])
+
+
 def test_undrawable_splats_are_dropped_with_a_warning(tmp_path):
     foreign(tmp_path, scales=[(0.1, float("nan"), 0.3)])
     warnings = []
