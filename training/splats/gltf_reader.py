@@ -53,6 +53,9 @@ _SPZ_SPLAT = 19
 """Minimum bytes of a splat of SPZ before compression."""
 _MAX_RATIO = 20
 """Maximum ratio of compression that is read; that of trained splats is about 2."""
+_INSTANCING = "EXT_mesh_gpu_instancing"
+_MEMORY, _RATIO = 1 << 27, 64
+"""Bytes of splats in instances that a file of any size may have, and further bytes per byte of its size."""
 _DEFECTS = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, struct.error)
 _TRANSFORM = {"matrix", "rotation", "scale", "translation"}
 _PlacedParts = list[tuple[Splats, np.ndarray]]
@@ -79,7 +82,8 @@ class _GlbReader:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._buffers: dict[int, np.ndarray] = {}
-        self._splats = 0
+        self._meshes: dict[int, list[Splats]] = {}
+        self._splats = self._placed = 0
         self._meta: dict = {}
         with open_file(path) as file:
             self._size = os.fstat(file.fileno()).st_size
@@ -189,12 +193,35 @@ class _GlbReader:
         """Return the splats of a node, and its transform."""
         if "mesh" not in node:
             return []
-        primitives = self._item("meshes", node["mesh"])["primitives"]
-        return [
-            (self._primitive(primitive), matrix)
-            for primitive in primitives
-            if {SPLATS, _COMPRESSIONS[-1]} & primitive.get("extensions", {}).keys()
-        ]
+        splats = self._mesh(_natural(node["mesh"]))
+        places = self._instances(node)
+        self._placed += len(places) * sum(map(len, splats))
+        if self._placed * _MIN_SPLAT > _MEMORY + _RATIO * self._size:
+            raise ValueError(f"it is too short for {self._placed:,} splats in instances")
+        return [(part, matrix @ place) for place in places for part in splats]
+
+    def _mesh(self, index: int) -> list[Splats]:
+        """Return the splats of a mesh, which several nodes may show."""
+        if index not in self._meshes:
+            self._meshes[index] = [
+                self._primitive(primitive)
+                for primitive in self._item("meshes", index)["primitives"]
+                if {SPLATS, _COMPRESSIONS[-1]} & primitive.get("extensions", {}).keys()
+            ]
+        return self._meshes[index]
+
+    def _instances(self, node: dict) -> list[np.ndarray]:
+        """Return the transforms (4, 4) of the instances of a node's mesh, relative to the node."""
+        attributes = node.get("extensions", {}).get(_INSTANCING, {}).get("attributes", {})
+        columns = {
+            name.lower(): self._accessor(index, 4 if name == "ROTATION" else 3)
+            for name, index in attributes.items()
+            if name.lower() in _TRANSFORM
+        }
+        if not columns:
+            return [np.eye(4)]
+        rows = zip(*columns.values(), strict=True)
+        return [_matrix(dict(zip(columns, row, strict=True))) for row in rows]
 
     def _primitive(self, primitive: dict) -> Splats:
         extension = primitive["extensions"].get(SPLATS)

@@ -13,7 +13,7 @@ from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_spz import spz, spz4
 from training.editing.export import FileOptions, export_finest_level, export_levels
 from training.errors import LodgsError
-from training.splats import gltf
+from training.splats import gltf, gltf_reader
 from training.splats.formats import find_format
 from training.splats.gaussians import SH_C0
 from training.splats.gltf import write_compressed_glb
@@ -200,6 +200,67 @@ def test_objects_with_and_without_levels_are_joined(tmp_path):
     joined = rewrite(tmp_path / "a.glb", copy)
     counts = [len(level.splats) for level in joined.levels]
     assert counts == [coarse + middle + fine, 2 * middle + fine, 3 * fine]
+
+
+def export_mesh(path, count=1):
+    """Export splats at (1, 2, 3), and return the document and its binary data."""
+    splats = random_splats(count)
+    splats.means[:] = (1, 2, 3)
+    splats.sh = splats.sh[:, :1]
+    export_levels(path, Bundle("", [Level(1, splats)]))
+    return read_parts(path)
+
+
+def centers(document, data, path):
+    """Write a document with splats around their node, and return the splats' means in glTF's axes."""
+    path.write_bytes(assembled(document, data))
+    bundle = read(path)
+    (level,) = bundle.levels
+    return level.splats.means.astype(np.float64) + bundle.meta.get("origin", 0)
+
+
+def test_nodes_may_share_a_mesh(tmp_path):
+    document, data = export_mesh(tmp_path / "a.glb", 1000)
+    document["scenes"] = [{"nodes": [0, 1, 2, 3]}]
+    document["nodes"] = [{"mesh": 0, "translation": [x, 0, 0]} for x in range(4)]
+    means = centers(document, data, tmp_path / "a.glb")
+    np.testing.assert_allclose(means, [[1 + x, 2, 3] for x in range(4) for _ in range(1000)], rtol=1e-5)
+
+
+def test_instances_of_a_mesh(tmp_path):
+    """Instances are turned and scaled before the node moves them."""
+    document, data = export_mesh(tmp_path / "a.glb")
+    count, half = 3, 0.5**0.5
+    columns = {
+        "TRANSLATION": np.float32([[0, 0, 0], [10, 0, 0], [0, 0, 0]]),
+        "ROTATION": np.float32([[0, 0, 0, 1], [0, 0, 0, 1], [0, 0, half, half]]),  # a quarter around z
+        "SCALE": np.float32([[1, 1, 1], [2, 2, 2], [1, 1, 1]]),
+    }
+    attributes = {}
+    for name, values in columns.items():
+        view = {"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes}
+        kind = f"VEC{values.shape[1]}"
+        attributes[name] = len(document["accessors"])
+        entry = {"bufferView": len(document["bufferViews"]), "componentType": 5126, "type": kind}
+        document["accessors"].append({**entry, "count": count})
+        document["bufferViews"].append(view)
+        data += values.tobytes()
+    document["buffers"][0]["byteLength"] = len(data)
+    instancing = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    document["scenes"] = [{"nodes": [0]}]
+    document["nodes"] = [{"mesh": 0, "translation": [0, 100, 0], "extensions": instancing}]
+    means = centers(document, data, tmp_path / "a.glb")
+    np.testing.assert_allclose(means, [[1, 102, 3], [12, 104, 6], [-2, 101, 3]], rtol=1e-5)
+
+
+def test_too_many_instances_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(gltf_reader, "_MEMORY", 0)
+    monkeypatch.setattr(gltf_reader, "_RATIO", 1)
+    document, data = export_mesh(tmp_path / "a.glb")
+    document["nodes"] = [{"mesh": 0} for _ in range(1000)]
+    del document["scenes"]
+    with pytest.raises(LodgsError, match=r"too short for .* splats in instances"):
+        centers(document, data, tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize("antialias", [True, False])
