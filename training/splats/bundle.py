@@ -27,6 +27,7 @@ from .dialects import Warn, comments_from_meta, drawable_3dgs, drop_undrawable, 
 from .file_rows import FileRows
 from .gaussians import Splats
 from .levels import NO_SPLATS, Bundle, Level
+from .mapped_rows import release_pages
 from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
 from .ply import (
     Columns,
@@ -34,7 +35,6 @@ from .ply import (
     extra_columns,
     read_comments,
     read_elements,
-    release_pages,
     splat_columns,
     splats_from_rows,
     write_elements,

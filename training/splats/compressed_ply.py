@@ -15,8 +15,9 @@ import numpy as np
 from ..errors import LodgsError
 from .dialects import comments_from_meta, meta_from_comments
 from .gaussians import SH_C0, SplatRows, Splats
+from .mapped_rows import release_pages
 from .morton import spatial_order
-from .ply import Element, read_elements, release_pages, write_elements
+from .ply import Element, read_elements, write_elements
 from .portable_levels import batches, splats_from_activated
 from .quats import join_quats, split_quats
 from .sh import coefficient_count

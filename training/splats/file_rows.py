@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import LodgsError
 from .batches import batch_slices
 from .coding import CodedRows
 from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
 from .gaussians import Splats
+from .mapped_rows import release_pages, require_size
 from .origin import NO_ORIGIN
-from .ply import BATCH_ROWS, read_elements, release_pages, splats_from_rows
+from .ply import BATCH_ROWS, read_elements, splats_from_rows
 
 _ROW = "row"
 """Extra column with each splat's row in the file."""
@@ -56,7 +55,7 @@ class FileRows:
         for rows in (self.vertices, self.extras):
             if rows is None:
                 continue
-            _check_size(rows, self.path)
+            require_size(rows, self.path)
             available = [name for name in names if name in (rows.dtype.names or ())]
             if isinstance(rows, CodedRows):
                 decoded = np.asarray(rows[index])
@@ -72,9 +71,9 @@ class FileRows:
         Raises:
             LodgsError: another program has truncated the file, or see ``splats_from_rows``.
         """
-        _check_size(self.vertices, self.path)
+        require_size(self.vertices, self.path)
         if self.extras is not None:
-            _check_size(self.extras, self.path)
+            require_size(self.extras, self.path)
         splats = splats_from_rows(self.vertices[index], self.path, self.origin)
         if self.extras is not None:
             extras = self.extras[index]
@@ -83,22 +82,6 @@ class FileRows:
         if self.extras is not None:
             release_pages(self.extras)
         return splats
-
-
-def _check_size(rows: np.ndarray | CodedRows, path: str | Path) -> None:
-    """Raise a LodgsError if a mapped file has lost rows: the system ends processes that read there."""
-    base: object = rows.codes if isinstance(rows, CodedRows) else rows
-    offset = 0
-    while isinstance(base, np.ndarray):
-        offset = getattr(base, "offset", offset)
-        base = base.base
-    if isinstance(base, mmap.mmap):
-        begin = offset - offset % mmap.ALLOCATIONGRANULARITY
-        if base.size() < begin + len(base):
-            raise LodgsError(
-                f"Cannot read {path}: another program has truncated it.",
-                "Restore the file, and open it again.",
-            )
 
 
 class DrawableRows:

@@ -16,7 +16,7 @@ import numpy as np
 from ..documents import open_file
 from ..errors import LodgsError
 from .gaussians import SH_C0, Splats
-from .ply import release_pages
+from .mapped_rows import release_pages
 
 _HEADER = np.dtype({
     "names": ["version", "max_sections", "sections", "count", "compression", "sh_range"],

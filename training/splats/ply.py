@@ -7,7 +7,6 @@ coefficients first, then green, then blue), opacity, scale_0..2, rot_0..3 (Kerbl
 from __future__ import annotations
 
 import io
-import mmap
 import os
 import re
 import warnings
@@ -29,6 +28,7 @@ from .colors import color_names, full_intensity
 from .content import check_name
 from .dialects import Warn, drawable_3dgs, ignore, reject_unsupported
 from .gaussians import SH_C0, SplatRows, Splats
+from .mapped_rows import release_pages, require_size
 from .origin import NO_ORIGIN
 
 MAX_HEADER_BYTES = 1 << 20
@@ -204,18 +204,12 @@ def splats_from_rows(
         origin: (3,) local origin to subtract from the positions.
 
     Raises:
-        LodgsError: columns are missing, or the number of f_rest columns fits no SH degree.
+        LodgsError: columns are missing, the number of f_rest columns fits no SH degree, or another program
+            has truncated the file.
     """
     rows = np.asarray(rows)
     names = rows.dtype.names or ()
-    rest_count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
-    degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}.get(rest_count)
-    if degree is None:
-        raise LodgsError(
-            f"Cannot read {path}: its {rest_count} f_rest columns fit no degree of spherical harmonics.",
-            "Export the splats again; degree 0 to 4 have 0, 9, 24, 45 or 72 such columns.",
-        )
-    splats = _empty_splats(len(rows), degree)
+    splats = _empty_splats(len(rows), _sh_degree(names, path))
     flat = {"scale_2"} - set(names)  # 2D Gaussian Splatting
     columns = {name: part for name, part in splat_columns(splats).items() if name not in {*NORMALS, *flat}}
     missing = [name for name in columns if name not in names]
@@ -238,6 +232,7 @@ def splats_from_rows(
     ]
     with np.errstate(over="ignore", invalid="ignore"):  # infinities and NaN are dropped later
         for block in batch_slices(len(rows), _BLOCK):
+            require_size(rows, path)
             for column, source in pairs:
                 column[block] = source[block]
             for axis in np.flatnonzero(origin):
@@ -253,6 +248,18 @@ def splats_from_rows(
         extras = {name: column for name, column in extras.items() if name not in NORMALS}
     splats.extras = extras
     return splats
+
+
+def _sh_degree(names: Sequence[str], path: str | Path) -> int:
+    """Return the SH degree of columns; raise LodgsError if their number fits none."""
+    rest_count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}.get(rest_count)
+    if degree is None:
+        raise LodgsError(
+            f"Cannot read {path}: its {rest_count} f_rest columns fit no degree of spherical harmonics.",
+            "Export the splats again; degree 0 to 4 have 0, 9, 24, 45 or 72 such columns.",
+        )
+    return degree
 
 
 def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -298,15 +305,6 @@ def read_elements(path: str | Path, splats: bool = True) -> tuple[dict[str, np.n
             elements[name] = mapped
             begin += count * row.itemsize
     return decode_elements(elements, path), _comments(header)
-
-
-def release_pages(rows: np.ndarray | CodedRows) -> None:
-    """Release the pages of a mapped file that have been read, which count as memory of the process."""
-    base = rows.codes if isinstance(rows, CodedRows) else rows
-    while isinstance(base, np.ndarray):
-        base = base.base
-    if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
-        base.madvise(mmap.MADV_DONTNEED)
 
 
 def read_comments(path: str | Path) -> list[str]:

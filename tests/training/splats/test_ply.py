@@ -2,6 +2,7 @@
 
 import os
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -197,6 +198,31 @@ def test_file_that_another_program_truncates_is_reported(tmp_path):
     for read in (rows.select, lambda index: rows.columns(index, ["x"])):
         with pytest.raises(LodgsError, match="another program has truncated it"):
             read(slice(2990, 3000))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+def test_file_that_is_truncated_while_it_is_read_is_reported(tmp_path):
+    """A process of its own, because reading beyond the end ends it."""
+    write_ply(tmp_path / "a.ply", random_splats(50_000))
+    program = """
+import os, sys
+from training.errors import LodgsError
+from training.splats import ply
+
+def batches(count, size):
+    for begin in range(0, count, size):
+        yield slice(begin, min(begin + size, count))
+        os.truncate(sys.argv[1], 1_000_000)
+
+ply.batch_slices = batches
+try:
+    ply.read_ply(sys.argv[1])
+except LodgsError as error:
+    print(error)
+"""
+    command = [sys.executable, "-c", program, tmp_path / "a.ply"]
+    process = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True)
+    assert "another program has truncated it" in process.stdout, process
 
 
 def test_checkpoints_name_their_program(tmp_path):

@@ -12,7 +12,8 @@ from ...errors import LodgsError
 from ...files import atomic_write
 from ..batches import batch_slices
 from ..gaussians import SH_C0, SplatRows, Splats
-from ..ply import BATCH_ROWS, release_pages
+from ..mapped_rows import release_pages
+from ..ply import BATCH_ROWS
 from ..splat_format import SplatFormat
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
