@@ -278,7 +278,7 @@ class _TrainingRun:
         """Train all remaining steps; save and return False on a stop signal or a cancel request."""
         method = self.method
         begin = last_checkpoint = last_progress = time.monotonic()
-        self._started, self._started_step = begin, self.step
+        self._speed_start = begin, self.step
         while not self._stopped(received):
             if self.step == method.steps:
                 return True
@@ -377,16 +377,18 @@ class _TrainingRun:
         )
 
     def _report_progress(self, level: int, loss: float, quality: float) -> None:
-        steps = self.method.steps
-        speed = (self.step - self._started_step) / max(time.monotonic() - self._started, 1e-6)
+        """Write a ``progress`` event, with the speed of about the last ten seconds."""
+        steps, now = self.method.steps, time.monotonic()
+        begin, first_step = self._speed_start
+        speed = (self.step - first_step) / max(now - begin, 1e-6)
         self.events(
             "progress", stage=self.method.stage(self.step - 1), level=level, levels=self.method.levels,
             step=self.step, of=steps, loss=round(loss, 5), psnr=round(min(quality, 100.0), 2),
             splats=self.method.splats, steps_per_s=round(speed, 2),
             eta_s=round((steps - self.step) / speed, 1),
         )  # fmt: skip
-        if time.monotonic() - self._started > 10:  # measure speed over the last ten seconds
-            self._started, self._started_step = time.monotonic(), self.step
+        if now - begin > 10:
+            self._speed_start = now, self.step
 
     def _write_levels(self, levels: list[Level]) -> None:
         """Write a file and an event for each finished level; replace a level that was written before."""

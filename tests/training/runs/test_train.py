@@ -120,7 +120,7 @@ def test_time_left_follows_the_speed_of_the_last_steps(monkeypatch):
     run = object.__new__(training_loop._TrainingRun)
     run.method = SimpleNamespace(steps=100, levels=1, splats=5, stage=lambda step: "")
     run.events = lambda kind, **values: events.append(values)
-    run._started, run._started_step, run.step = 0.0, 0, 0
+    run._speed_start, run.step = (0.0, 0), 0
     while run.step < 100:
         now += 1.0 if run.step < 40 else 3.0
         run.step += 1
