@@ -1,4 +1,4 @@
-"""Plan of the cells of a large scene, stored on its root (``training``)."""
+"""Plan of the cells of a large scene, stored on its root (``training_settings``)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...training.scenes.regions import Region
 from . import photographs
 
 if TYPE_CHECKING:
-    from .training import TrainingCell, TrainingSettings
+    from .training_settings import TrainingCell, TrainingSettings
 
 GROUND_QUANTILE = 0.01
 """Quantile of the point heights at which cells are drawn."""

@@ -9,7 +9,7 @@ from ...training.render.lens import MAX_SAMPLES
 from .. import compat
 from .property_callbacks import look_up, tag_owner
 from .scene_properties import CONTROLS, SplatLevel, SplatScene, SplatSource, SplatStream, SplatTable
-from .training import PARAMETERS, TrainingCell, TrainingSettings
+from .training_settings import PARAMETERS, TrainingCell, TrainingSettings
 from .viewpoints import ViewsSettings
 
 _redraw = look_up("redraw")

@@ -11,7 +11,7 @@ from ..nodes.camera_choices import CHOICES, find_choice
 from .property_callbacks import look_up, tag_owner
 from .selection import read_json
 from .setting_properties import SUBTYPES
-from .training import TrainingSettings
+from .training_settings import TrainingSettings
 
 _view_chosen = look_up("active_view")
 _camera_input_changed = look_up("camera_input")

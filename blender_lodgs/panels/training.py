@@ -10,7 +10,7 @@ from ...training.lod.rule import resolve_rule
 from ...training.methods import method_info
 from .. import extension
 from ..data import roots, viewpoints
-from ..data.training import (
+from ..data.training_settings import (
     COMMON_PARAMETERS,
     PANEL_KEYS,
     has_level_distances,

@@ -18,7 +18,7 @@ from ...training.runs.job import DOME, Job
 from .. import extension
 from ..data import crops, viewpoints
 from ..data.paths import absolute_path
-from ..data.training import (
+from ..data.training_settings import (
     PANEL_KEYS,
     has_level_distances,
     hold_out_interval,
@@ -28,7 +28,7 @@ from ..data.training import (
 from .run_folders import run_folder, run_state
 
 if TYPE_CHECKING:
-    from ..data.training import TrainingSettings
+    from ..data.training_settings import TrainingSettings
 
 
 def make_job(root: bpy.types.Object, out: Path, parameters: dict) -> Job:

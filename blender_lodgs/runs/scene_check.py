@@ -15,7 +15,7 @@ from ...training.errors import LodgsError
 from ...training.runs.job import Job
 from ...training.scenes.check import ESTIMATE, SEVERITIES, Finding, check_folder
 from ..data.paths import absolute_path
-from ..data.training import hold_out_interval
+from ..data.training_settings import hold_out_interval
 from . import environment, job_settings, run_folders
 
 TIMEOUT = 600.0

@@ -28,7 +28,7 @@ def object_with_method(bpy, lodgs, monkeypatch):
     }
     info = methods.MethodInfo("new", 98, "New", "a method", NewParameters, presets, panel_parameters=offered)
     monkeypatch.setitem(methods.METHODS, "new", info)
-    group = lodgs("data.training")._parameters_of(info)
+    group = lodgs("data.training_settings")._parameters_of(info)
     bpy.utils.register_class(group)
     bpy.types.Object.new_method = bpy.props.PointerProperty(type=group)
     obj = bpy.data.objects.new("object", None)
@@ -106,7 +106,7 @@ def scene_with_photos(bpy):
 
 @pytest.mark.parametrize(("count", "interval"), [(0, 0), (2, 0), (39, 0), (40, 8), (48, 8)])
 def test_photos_are_held_out_if_there_are_enough(lodgs, scene_with_photos, count, interval):
-    root, training = scene_with_photos(count), lodgs("data.training")
+    root, training = scene_with_photos(count), lodgs("data.training_settings")
     settings = root.lodgs.training
     assert (
         training.hold_out_interval(root) == settings.preset_test_every == interval
