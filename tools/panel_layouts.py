@@ -51,6 +51,8 @@ def panel_digests(bpy) -> dict[str, str]:
     for module in modules:
         if hasattr(module, "say"):
             vars(module)["say"] = lambda layout, text, icon: layout.label(text=text)
+        if hasattr(module, "sidebar_width"):
+            vars(module)["sidebar_width"] = lambda: 292
     layouts: dict[str, list] = {}
     for prepare in (lambda bpy: None, _import_scene, _add_levels):
         prepare(bpy)

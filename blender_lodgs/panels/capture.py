@@ -31,7 +31,7 @@ class LODGS_PT_capture(Panel):
         if work is not None and work.problem:
             say(layout, work.problem, "ERROR")
         elif work is not None:
-            layout.label(text=work.message, icon="CHECKMARK" if work.fraction == 1 else "PAUSE")
+            say(layout, work.message, "CHECKMARK" if work.fraction == 1 else "PAUSE")
         _draw_settings(layout, context)
         try:
             environment.trainer_python()

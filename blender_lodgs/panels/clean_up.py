@@ -50,7 +50,7 @@ class LODGS_PT_clean_up(LevelsPanel):
 
         column = layout.column(align=True)
         for number, (visible, total) in cleaning.count_remaining(root, context.view_layer.depsgraph).items():
-            column.label(text=f"Level {number}: {visible:,} of {total:,} splats")
+            say(column, f"Level {number}: {visible:,} of {total:,} splats", "NONE")
         lost = {item.number: item.lost for item in root.lodgs.existing_levels if item.lost}
         if lost:
             counts = ", ".join(f"level {number}: {count:,}" for number, count in lost.items())

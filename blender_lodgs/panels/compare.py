@@ -24,10 +24,12 @@ class LODGS_UL_views(bpy.types.UIList):
         psnr = item.data.lodgs.psnr
         root, is_camera = roots.active_root(context), item == context.scene.camera
         held_out = root is not None and photographs.is_held_out(root, item)
-        split = layout.split(factor=0.62)
-        split.label(text=item.name, icon="VIEW_CAMERA" if is_camera else "CAMERA_DATA")
-        quality = f"{psnr:.1f} dB" if psnr > 0 else ""
-        split.label(text=quality, icon=HELD_OUT if held_out else "BLANK1")
+        has_quality = psnr > 0 or held_out
+        row = layout.split(factor=0.62) if has_quality else layout
+        row.label(text=item.name, icon="VIEW_CAMERA" if is_camera else "CAMERA_DATA")
+        if has_quality:
+            quality = f"{psnr:.1f} dB" if psnr > 0 else ""
+            row.label(text=quality, icon=HELD_OUT if held_out else "BLANK1")
 
     def draw_filter(self, context, layout):
         row = layout.row(align=True)
@@ -99,7 +101,7 @@ def _draw_evidence(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         return
     column = layout.column(align=True)
     for tint, grade, share in zip(evidence.TINTS, GRADES, shares, strict=True):
-        column.label(text=f"{grade}: {share:.0%}", icon=TINT_ICONS[tint])
+        say(column, f"{grade}: {share:.0%}", TINT_ICONS[tint])
 
 
 def _draw_methods(layout: bpy.types.UILayout) -> None:
@@ -128,7 +130,7 @@ def _draw_means(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
         if views:
             mean = sum(view.data.lodgs.psnr for view in views) / len(views)
             text = f"{name}: {mean:.1f} dB ({len(views)} view{'s' * (len(views) != 1)})"
-            column.label(text=text, icon=icon)
+            say(column, text, icon)
 
 
 CLASSES = (LODGS_UL_views, LODGS_PT_compare)

@@ -175,13 +175,13 @@ class LODGS_PT_stream(LevelsPanel):
         elif stream is not None and stream.problem:
             say(layout, f"{stream.problem} Only the splats in memory are drawn.", "ERROR")
         elif stream is None:  # no viewport draws splats
-            layout.label(text="Streams when the viewport draws splats", icon="INFO")
+            say(layout, "Streams when the viewport draws splats", "INFO")
         elif stream.busy:
-            layout.label(text="Loading finer splats…", icon="SORTTIME")
+            say(layout, "Loading finer splats…", "SORTTIME")
         elif stream.short:
-            layout.label(text="Limit reached for this view", icon="INFO")
+            say(layout, "Limit reached for this view", "INFO")
         else:
-            layout.label(text="Full detail for this view", icon="CHECKMARK")
+            say(layout, "Full detail for this view", "CHECKMARK")
         column = split_column(layout)
         column.prop(settings, "file")
         column.prop(settings, "budget")

@@ -7,7 +7,7 @@ import bpy
 from ...training.evaluate.costs import cost_lines
 from ..data import roots, selection
 from ..runs import run_folders
-from .parts import LevelsPanel, scene_length
+from .parts import LevelsPanel, say, scene_length
 
 
 class LODGS_PT_costs(LevelsPanel):
@@ -25,7 +25,7 @@ class LODGS_PT_costs(LevelsPanel):
         column = self.layout.column(align=True)
         column.label(text="Splats per Image Tile")
         for line in _lines(context, root):
-            column.label(text=line)
+            say(column, line, "NONE")
         if run_folders.cost_plot(root) is not None:
             self.layout.operator("lodgs.show_costs", icon="GRAPH")
 

@@ -62,7 +62,7 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     column = layout.column(align=True)
     column.scale_y = 0.8
     columns = max(int((sidebar_width() - 85) / 5.6), 12)  # letters of the default font, without icon and tabs
-    text = re.sub(r"(\d) (?=([kMG]|s|[cmk]?m|[kMGT]B)\b)", "\\1\u00a0", text)  # keep units on the line
+    text = re.sub(r"(\d) (?=([kMG]|s|[cmk]?m|[kMGT]B|dB)\b)", "\\1\u00a0", text)  # keep units on the line
     for number, line in enumerate(textwrap.wrap(text, columns, break_on_hyphens=False)):
         line = line.replace("\u00a0", " ")
         column.label(text=line, icon="BLANK1" if number and icon != "NONE" else icon)  # type: ignore[arg-type]

@@ -88,7 +88,7 @@ def _draw_check(layout: bpy.types.UILayout, root: bpy.types.Object) -> None:
     layout.operator("lodgs.check_scene", icon="VIEWZOOM")
     findings = scene_check.last_findings(root)
     if findings is not None and all(finding.severity == INFO for finding in findings):
-        layout.label(text="Nothing found that lowers the quality", icon="CHECKMARK")
+        say(layout, "Nothing found that lowers the quality", "CHECKMARK")
     for finding in findings or ():
         say(layout, str(finding), _ICONS[finding.severity])
 

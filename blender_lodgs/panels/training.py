@@ -128,7 +128,7 @@ def _draw_choices(
         text += f", {settings.columns * settings.rows} cells" if settings.grid and not without_photos else ""
         from_base = without_photos or (info.from_base and settings.start_from != "POINTS")
         steps = parameters.base_steps if from_base else parameters.total_steps
-        column.label(text=f"{steps:,} steps{text}")
+        say(column, f"{steps:,} steps{text}", "NONE")
         match hold_out_interval(root):
             case 0 if not without_photos:
                 say(layout, "No views are held out, so quality is measured on training views.", "INFO")
@@ -157,7 +157,7 @@ def _draw_choices(
     if root.lodgs.scene_folder and not estimate:
         row.operator("lodgs.check_scene", text="", icon="TIME")
     if root.session_uid in scene_check.running:
-        layout.label(text="Estimating time and memory…", icon="TIME")
+        say(layout, "Estimating time and memory…", "TIME")
 
 
 def _draw_views(column: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
@@ -211,7 +211,7 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Obje
     if note:
         say(layout, note.rstrip(")").capitalize(), "INFO")
     if watch.cancel_requested:
-        layout.label(text="Cancel again to stop immediately", icon="INFO")
+        say(layout, "Cancel again to stop immediately", "INFO")
     elif watch.unresponsive:
         say(layout, "The trainer is not responding. Cancel it, then resume.", "ERROR")
     draw_cells(layout, root, watch)
@@ -226,7 +226,7 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Obje
 def _draw_ended(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Object) -> None:
     box = layout.box()
     loaded = {item.number for item in root.lodgs.existing_levels}
-    box.label(text=watch.message, icon="CHECKMARK" if watch.state == "done" else "PAUSE")
+    say(box, watch.message, "CHECKMARK" if watch.state == "done" else "PAUSE")
     column = box.column(align=True)
     events = [watch.levels[number] for number in sorted(watch.levels.keys() & loaded)]
     if views := next(filter(None, map(measured_on, events)), ""):

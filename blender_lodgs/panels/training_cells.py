@@ -121,7 +121,7 @@ def _draw_plan(layout, settings):
     rows = min(max(len(settings.planned_cells), 3), 8)
     layout.template_list("LODGS_UL_cells", "", settings, "planned_cells", settings, "active_cell", rows=rows)
     cell = settings.planned_cells[settings.active_cell]
-    layout.label(text=f"{cell.points:,} initial points, {cell.steps:,} steps")
+    say(layout, f"{cell.points:,} initial points, {cell.steps:,} steps", "NONE")
 
 
 def draw_cells(layout: bpy.types.UILayout, root: bpy.types.Object, watch: Watch) -> None:

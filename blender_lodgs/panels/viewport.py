@@ -54,7 +54,7 @@ class LODGS_PT_viewport(Panel):
             say(layout, text, "ERROR")
         counts = views.reduced_counts()
         if settings.splats and not settings.native and counts:
-            layout.label(text=_budget_text(*counts), icon="INFO")
+            say(layout, _budget_text(*counts), "INFO")
         suggestion = view_state.suggest_budget()
         if settings.splats and not settings.native and suggestion:
             count, seconds, budget = suggestion

@@ -28,6 +28,7 @@ class RecordingLayout:
         return self, self
 
     def label(self, text="", **_):
+        assert len(text) <= 24, f"Narrow sidebars cut off {text!r}. Use say."
         self.texts.append(text)
 
     def progress(self, text, factor):
@@ -71,8 +72,9 @@ def draw_panel(bpy, lodgs, monkeypatch):
         layout = RecordingLayout()
         for patched in (module, lodgs("panels.parts")):
             monkeypatch.setattr(
-                patched, "say", lambda layout, text, icon: layout.label(text=text), raising=False
+                patched, "say", lambda layout, text, icon: layout.texts.append(text), raising=False
             )
+            monkeypatch.setattr(patched, "sidebar_width", lambda: 292, raising=False)
         getattr(module, panel).draw(SimpleNamespace(layout=layout), bpy.context)
         return layout
 

@@ -273,3 +273,11 @@ def test_by_distance_shows_its_savings_and_offers_to_reduce_detail(bpy, lodgs, d
     with pytest.raises(RuntimeError, match="Cannot save splats"):
         bpy.ops.lodgs.reduce_detail()
     assert root.lodgs.bands.gamma == gamma and root.lodgs.mode == "SINGLE"
+
+
+@pytest.mark.parametrize(("width", "count"), [(292, 4), (220, 2)])
+def test_narrow_sidebars_list_fewer_columns(lodgs, monkeypatch, width, count):
+    panel, layout = lodgs("panels.levels"), RecordingLayout()
+    monkeypatch.setattr(panel, "sidebar_width", lambda: width)
+    panel._columns(layout, "1", "1,926", "0.5", "all")
+    assert layout.texts == ["1", "1,926", "0.5", "all"][:count]

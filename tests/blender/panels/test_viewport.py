@@ -143,6 +143,10 @@ def test_wrapped_texts_keep_units_with_their_numbers(wrap):
     assert lines == ["Half the views are 44.7 m or", "89.4 m from the centre of the", "splats."]
 
 
+def test_wrapped_texts_keep_decibels_with_their_number(wrap):
+    assert wrap(210, "Training views: 44.7 dB")[0] == ["Training views:", "44.7 dB"]
+
+
 def test_texts_fit_a_narrow_sidebar(wrap):
     lines, icons = wrap(180, "For quick redraws, set Splat Budget to 20,000.")
     assert lines == ["For quick", "redraws, set", "Splat Budget to", "20,000."]

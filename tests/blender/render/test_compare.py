@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.blender.panels.conftest import RecordingLayout
 from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
@@ -327,3 +328,13 @@ def test_list_sorts_the_worst_view_first(bpy, lodgs, root):
     fake.filter_name = "view_07"
     visible, _ = filter_items(fake, bpy.context, root.lodgs.cameras, "objects")
     assert sum(map(bool, visible)) == 1
+
+
+def test_list_shows_names_alone_before_a_measurement(bpy, lodgs, root):
+    view, layout = root.lodgs.cameras.objects[3], RecordingLayout()
+    view.data.lodgs.held_out = False
+    draw_item = lodgs("panels.compare").LODGS_UL_views.draw_item
+    for psnr, texts in ((0.0, [view.name]), (20.0, [view.name, view.name, "20.0 dB"])):
+        view.data.lodgs.psnr = psnr
+        draw_item(None, bpy.context, layout, root.lodgs.cameras, view, 0, root.lodgs, "active_view")
+        assert layout.texts == texts
