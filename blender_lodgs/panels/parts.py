@@ -61,7 +61,8 @@ def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
     """Draw a text that wraps to the panel's width."""
     column = layout.column(align=True)
     column.scale_y = 0.8
-    columns = max(int((sidebar_width() - 85) / 5.6), 12)  # letters of the default font, without icon and tabs
+    margin = 65 if icon == "NONE" else 85  # tabs, borders and icon
+    columns = max(int((sidebar_width() - margin) / 5.6), 12)  # letters of the default font
     text = re.sub(r"(\d) (?=([kMG]|s|[cmk]?m|[kMGT]B|dB)\b)", "\\1\u00a0", text)  # keep units on the line
     for number, line in enumerate(textwrap.wrap(text, columns, break_on_hyphens=False)):
         line = line.replace("\u00a0", " ")

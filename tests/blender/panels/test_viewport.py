@@ -152,3 +152,5 @@ def test_texts_fit_a_narrow_sidebar(wrap):
     assert lines == ["For quick", "redraws, set", "Splat Budget to", "20,000."]
     assert icons == ["INFO", "BLANK1", "BLANK1", "BLANK1"]
     assert set(wrap(180, "57,644 of 108,804 splats shown", "NONE")[1]) == {"NONE"}
+    assert len(wrap(230, "Level 1: 1,926 of 1,926 splats", "NONE")[0]) == 2
+    assert len(wrap(234, "Level 1: 1,926 of 1,926 splats", "NONE")[0]) == 1, "There is no icon."
