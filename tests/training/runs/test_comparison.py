@@ -5,6 +5,8 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +31,9 @@ from training.splats.bundle import write_bundle
 from training.splats.levels import Bundle, Level
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+CAPTURED = {"scene": "", "capture": "dome", "base": "a.ply"}
 
 
 @pytest.fixture(autouse=True)
@@ -188,6 +193,26 @@ def test_runs_of_other_scenes_are_refused(runs, tmp_path):
     RunFolder(other).job.write_text(text)
     with pytest.raises(LodgsError):
         compare([runs[0], other], tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ({"validation": False}, {"validation": True}),
+        (CAPTURED, CAPTURED | {"base": "b.ply"}),
+        (CAPTURED, CAPTURED | {"views": 12}),
+    ],
+)
+def test_runs_with_other_held_out_views_are_refused(first, second, runs, monkeypatch):
+    """Runs on captured views have no scene, which does not make them runs of one scene."""
+    job = Job.from_file(RunFolder(runs[0]).job)
+    jobs = {"a": replace(job, **first), "b": replace(job, **second)}
+    monkeypatch.setattr(
+        "training.runs.comparison.measures.open_finished", lambda run, warn: (None, jobs[run.name], None)
+    )
+    label_runs([Path("a")])
+    with pytest.raises(LodgsError, match="held-out"):
+        label_runs([Path("a"), Path("b")])
 
 
 def test_labels_tell_runs_apart(runs, tmp_path):

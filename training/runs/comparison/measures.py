@@ -320,9 +320,8 @@ def label_runs(runs: Sequence[Path]) -> list[str]:
             photos.
     """
     jobs = [open_finished(run, ignore)[1] for run in runs]
-    first = jobs[0]
     for run, job in zip(runs, jobs, strict=True):
-        if (job.scene, job.test_every) != (first.scene, first.test_every):
+        if _views_of(job) != _views_of(jobs[0]):
             raise LodgsError(
                 f"Cannot compare {run} with {runs[0]}: their scenes or held-out photos differ.",
                 "Choose runs of one scene.",
@@ -336,3 +335,9 @@ def label_runs(runs: Sequence[Path]) -> list[str]:
     if len(set(labels)) < len(labels):
         raise LodgsError("Cannot compare a run with itself: a run is named twice.", "Name each run once.")
     return labels
+
+
+def _views_of(job: Job) -> tuple:
+    """Return what determines the views that measure a run."""
+    captured = (job.base, job.capture, job.views, job.view_width) if job.capture else ()
+    return job.scene, job.test_every, job.validation, captured
