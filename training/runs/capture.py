@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,6 +28,9 @@ from .job import AUTO, DOME, MIN_VIEWS
 
 POINTS = 60_000
 """Approximate number of points in a captured scene, including those that only one view sees."""
+
+_MAX_NAME = 60
+"""Maximum length of a view's name in an image's name, which file systems limit to 255 bytes."""
 
 ReportView = Callable[[int, int], object]
 """Called before each view with its number, from 1, and the number of views."""
@@ -165,7 +169,8 @@ def _write(
         points, report, origin: see :func:`write_scene`.
     """
     rng = np.random.default_rng(0)
-    views = [replace(camera, name=f"{camera.name}.jpg") for camera in cameras]
+    names = _image_names([camera.name for camera in cameras])
+    views = [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
     positions = []
     colors = []
     for number, view in enumerate(views):
@@ -186,3 +191,16 @@ def _write(
         scene, views, lambda number: np.load(scene / "depths" / f"{number}.npy"),
         np.concatenate(positions), np.concatenate(colors), origin,
     )  # fmt: skip
+
+
+def _image_names(views: Sequence[str]) -> list[str]:
+    """Return a different file name without folders for the image of each view.
+
+    A bundle may name its views like photos in subfolders, or, from another program, like files elsewhere.
+    """
+    names: dict[str, str] = {}
+    for number, view in enumerate(views):
+        name = re.sub(r'[\x00-\x1f\\/:*?"<>|\ud800-\udfff]', "_", view).lstrip(". ")[-_MAX_NAME:]
+        name = f"{number}_{name}" if not name or name.casefold() in names else name
+        names[name.casefold()] = f"{name}.jpg"
+    return list(names.values())

@@ -117,6 +117,19 @@ def test_own_cameras_of_a_bundle_are_used(ball, tmp_path, count):
         assert [camera.name.split("_")[0] for camera in scene.cameras] == ["close"] * 6 + ["dome"] * 6
 
 
+def test_views_of_a_bundle_are_captured_into_one_folder(ball, tmp_path):
+    """Bundles name views like photos, in subfolders; a foreign bundle's names may leave the folder."""
+    names = ["left/a.jpg", "right/a.jpg", "right\\A.jpg", "../../out", str(tmp_path / "absolute"), ""]
+    views, near = dome_views(ball, len(names), 48, 32)
+    views = [replace(view, name=name) for view, name in zip(views, names, strict=True)]
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball)], tables=make_view_tables(views, near)))
+    capture.capture(tmp_path / "b.ply", tmp_path / "a" / "scene", "auto", 8, 48, backend="cpu")
+    images = sorted(path.name for path in (tmp_path / "a" / "scene" / "images").iterdir())
+    assert len(images) == len(names) and {"left_a.jpg.jpg", "right_a.jpg.jpg"} < set(images)
+    assert capture.is_complete(tmp_path / "a" / "scene")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b.ply"]
+
+
 def test_captured_images_and_points_match_the_splats(ball, tmp_path):
     views, near = dome_views(ball, 12, 96, 64)
     count = write_scene(tmp_path / "scene", ball, views, near, points=2000)
