@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Protocol
 
 import numpy as np
@@ -60,6 +60,11 @@ class Splats:
         """Return the splats at ``index``: a slice, a boolean mask (N,) or an integer array."""
         columns = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "extras"}
         return Splats(**columns, extras={name: column[index] for name, column in self.extras.items()})
+
+    def padded(self, degree: int) -> Splats:
+        """Return the splats with zeros for missing coefficients up to a degree of at least their own."""
+        missing = (degree + 1) ** 2 - self.sh.shape[1]
+        return replace(self, sh=np.pad(self.sh, ((0, 0), (0, missing), (0, 0)))) if missing else self
 
     @classmethod
     def concatenated(cls, sets: list[Splats]) -> Splats:

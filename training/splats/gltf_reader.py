@@ -38,7 +38,6 @@ from .gltf import (
 from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import join_levels, parse_description, place_splats, splats_from_activated, upright_meta
 from .quats import rotation_matrices
-from .sh import coefficient_count
 from .spz import unpack_spz
 
 _MAX_JSON, _MAX_TEXT = 1 << 24, 1 << 28
@@ -155,10 +154,8 @@ class _GlbReader:
     def _foreign(self, fine_to_coarse: list[_PlacedParts]) -> Bundle:
         placed = [place_splats(*part, self._path) for parts in fine_to_coarse for part in parts]
         meta, splats = upright_meta(placed, "Y")
-        count = coefficient_count(max(part.sh_degree for part in splats))
-        for part in splats:
-            part.sh = np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0)))
-        remaining, levels = iter(splats), []
+        degree = max(part.sh_degree for part in splats)
+        remaining, levels = (part.padded(degree) for part in splats), []
         for number, parts in enumerate(fine_to_coarse):
             joined = Splats.concatenated([next(remaining) for _ in parts])
             levels.append(Level(len(fine_to_coarse) - number, joined))

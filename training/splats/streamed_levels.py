@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,7 +24,6 @@ from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
 from .ply import BATCH_ROWS, write_ply
 from .portable_levels import ConcatenatedRows
-from .sh import coefficient_count
 from .sog import MAX_DEGREE, META, encode_sog, load_packages, read_sog, relative_parts, sog_error
 
 STREAMED_FILE = "lod-meta.json"
@@ -121,7 +120,7 @@ def _write_files(
             names.append(f"{lod}_{number}/{META}")
             _write_sog(folder / names[-1], _read_file(rows, group, lod, len(names) - 1, degree), antialias)
     if len(surroundings):
-        splats = _with_degree(levels[0].select(surroundings), degree)
+        splats = levels[0].select(surroundings).padded(degree)
         _write_sog(folder / SURROUNDINGS, splats.select(spatial_order(splats.means)), antialias)
     if measure is not None:
         for leaf in leaves:
@@ -217,7 +216,7 @@ def _file_groups(leaves: Sequence[_Leaf], lod: int) -> Iterator[list[_Leaf]]:
 def _read_file(rows: SplatRows, leaves: Sequence[_Leaf], lod: int, file: int, degree: int) -> Splats:
     """Return a level's splats in leaves that share a file, and enter their ranges and bounds."""
     splats = _read_rows(rows, np.concatenate([leaf.rows[lod] for leaf in leaves]))
-    splats, reach, offset = _with_degree(splats, degree), _radii(splats), 0
+    splats, reach, offset = splats.padded(degree), _radii(splats), 0
     for leaf in leaves:
         count = len(leaf.rows[lod])
         part = slice(offset, offset + count)
@@ -233,12 +232,6 @@ def _read_rows(rows: SplatRows, wanted: np.ndarray) -> Splats:
     """Return splats by row, in any order."""
     order = np.argsort(wanted, kind="stable")
     return rows.select(wanted[order]).select(np.argsort(order, kind="stable"))
-
-
-def _with_degree(splats: Splats, degree: int) -> Splats:
-    """Return splats with zeros for missing coefficients, because all files must have the same degree."""
-    missing = coefficient_count(degree) - splats.sh.shape[1]
-    return replace(splats, sh=np.pad(splats.sh, ((0, 0), (0, missing), (0, 0))), extras={})
 
 
 def _describe(node: _Node) -> dict:
@@ -290,7 +283,7 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
             parts = [_select(read_part(names[file]), files[file]) for file in sorted(files)]
             parts += surroundings
             degree = max(part.sh_degree for part in parts)
-            splats = Splats.concatenated([_with_degree(part, degree) for part in parts])
+            splats = Splats.concatenated([part.padded(degree) for part in parts])
             write_ply(folder / f"lod{lod}.ply", splats, comments_from_meta(meta_of_splats))
     except LodgsError:
         raise

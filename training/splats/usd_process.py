@@ -114,8 +114,8 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     ]
     up = usd.UsdGeom.GetStageUpAxis(stage)
     meta, placed = upright_meta(placed, "Z" if up == usd.UsdGeom.Tokens.z else "Y")
-    degree = min(splats.sh_degree for splats in placed)
-    splats = {prim: _limited(part, degree) for prim, part in zip(items, placed, strict=True)}
+    degree = max(splats.sh_degree for splats in placed)
+    splats = {prim: part.padded(degree) for prim, part in zip(items, placed, strict=True)}
     distances = next((d for root in groups if (d := _thresholds(usd, root, count))), [])
     levels = [
         Level(
@@ -226,12 +226,6 @@ def _first_value(attribute):
     """Return the value of an attribute, or its value at the first time if it is animated."""
     times = attribute.GetTimeSamples()
     return attribute.Get(times[0]) if times else attribute.Get()
-
-
-def _limited(splats: Splats, degree: int) -> Splats:
-    """Return splats with coefficients up to a degree."""
-    splats.sh = np.ascontiguousarray(splats.sh[:, : coefficient_count(degree)])
-    return splats
 
 
 def _thresholds(usd: SimpleNamespace, root, count: int) -> list[float]:

@@ -287,6 +287,20 @@ def test_missing_and_excess_harmonics_follow_the_schema(tmp_path):
     assert read(tmp_path / "b.usdc").levels[0].splats.sh.tolist() == [[[1, 2, 3]]] * 2
 
 
+def test_fields_of_several_degrees_keep_their_harmonics(tmp_path):
+    """The highest degree holds for all; a field of a lower one, or a grey one, has zeros."""
+    stage = foreign(tmp_path)
+    prim = stage.GetPrimAtPath("/b")
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(1)
+    colors = [(1, 2, 3), (4, 0, 0), (0, 5, 0), (0, 0, 6)]
+    prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Set(colors)
+    stage.GetRootLayer().Save()
+    first, second = read(tmp_path / "b.usdc").levels[0].splats.sh
+    assert first.tolist() == [[1, 2, 3], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    assert second.tolist()[0] == [1, 2, 3]
+    np.testing.assert_allclose(np.linalg.norm(second[1:]), np.sqrt(16 + 25 + 36), rtol=1e-5)
+
+
 FIELD = """def ParticleField3DGaussianSplat "{}" {{
     point3f[] positions = [({}, 0, 0)]
     float3[] radiance:sphericalHarmonicsCoefficients = [(1, 0, 0)]
