@@ -187,7 +187,8 @@ def _write_cells(folder: Path, levels: PortableLevels) -> dict:
 
 
 def _meta(levels: PortableLevels) -> dict:
-    return {"up_rotation": levels.bundle.up_rotation.tolist()}
+    bundle = levels.bundle
+    return {"up_rotation": bundle.up_rotation.tolist(), **({"antialias": True} if bundle.antialias else {})}
 
 
 def _survey(rows: SplatRows, center: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from tests.training.splats.level_files import UP, flod, read
 from tests.training.splats.test_formats import random_splats
 from tests.training.splats.test_gltf import read_parts
-from training.editing.export import export_tiles
+from training.editing.export import FileOptions, export_tiles
 from training.errors import LodgsError
 from training.splats import tiles
 from training.splats.levels import Level
@@ -61,6 +61,15 @@ def test_tileset_is_nested(tmp_path, bundle):
         if not tile.get("children"):
             assert tile["geometricError"] == 0
     assert {path.name for path in tmp_path.iterdir()} == {"web"}
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_tiles_store_whether_splats_are_antialiased(tmp_path, bundle, antialias):
+    """Splats whose filter is not baked keep it, as in other files."""
+    bundle.meta["antialias"] = antialias
+    export_tiles(tmp_path / "web", bundle, FileOptions(antialiased=True))
+    for path in (tmp_path / "web").glob("*.glb"):
+        assert unpack_spz(read_parts(path)[1], 1000)[1].get("antialias", False) == antialias
 
 
 def test_each_splat_is_in_one_cell(tmp_path, bundle):
