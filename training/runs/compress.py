@@ -74,6 +74,7 @@ def compress(
     if out.suffix.lower() != ".ply":
         raise LodgsError(f"Cannot write {out}: compressed bundles are PLY files.", "End its name with .ply.")
     bundle = read_folder(path, warn) if path.is_dir() else read_bundle(path, warn)
+    limit_degree(bundle, settings.sh_degree).check()
     plain_size = sum(Element.from_splats("", [level.rows], all_columns).size for level in bundle.levels)
     counts = [len(level.rows) for level in bundle.levels]
     run = source if run is None and path != source else run

@@ -21,6 +21,7 @@ from training.scenes.cameras import Camera, look_at
 from training.scenes.colmap import read_scene
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import SH_C0, Splats
+from training.splats.level_folder import write_folder
 from training.splats.levels import Bundle, Level
 from training.splats.ply import write_ply
 
@@ -183,6 +184,16 @@ def test_command(run, tmp_path, splats, capsys):
     assert main(["compress", str(plain), *arguments]) == 0
     assert "none are removed, because it has no training views" in capsys.readouterr().err
     assert len(read_bundle(small).levels[0].splats) == len(splats)
+
+
+def test_levels_of_several_degrees_need_a_common_one(tmp_path, splats, capsys):
+    """A folder of levels may come from other programs."""
+    write_folder(tmp_path / "levels", Bundle("", [Level(1, splats), Level(2, splats)]))
+    write_ply(tmp_path / "levels" / "lod1.ply", replace(splats, sh=splats.sh[:, :1]))
+    arguments = ["compress", str(tmp_path / "levels"), "--out", str(tmp_path / "a.ply")]
+    assert main(arguments) == 2
+    assert "different degrees [0, 1]" in capsys.readouterr().err
+    assert main([*arguments, "--sh-degree", "0"]) == 0
 
 
 @pytest.mark.parametrize(
