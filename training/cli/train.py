@@ -48,7 +48,8 @@ def check_job(options: argparse.Namespace) -> int:
         print("Nothing to check: training renders its own views.")
         return 0
     model, images = job.model_and_images
-    findings = check_folder(Path(job.scene), model, images, image_scale=job.image_scale)
+    scale, exposure = job.image_scale, job.exposure
+    findings = check_folder(Path(job.scene), model, images, image_scale=scale, exposure=exposure)
     for finding in findings:
         print(f"{finding.severity}: {finding}")
     if all(finding.severity == INFO for finding in findings):

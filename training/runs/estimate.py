@@ -106,7 +106,7 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     job = job.resolved()
     parameters = job.resolved_parameters()
     model, images = job.model_and_images
-    scene = cached_points(read_scene(Path(job.scene), model, images))
+    scene = cached_points(read_scene(Path(job.scene), model, images), job.exposure)
     if not len(scene.points):
         raise LodgsError("the scene has no points yet.", "Training makes them first.")
     backend = choose_backend(job, scene)

@@ -60,6 +60,7 @@ def check_folder(
     images: Path | None = None,
     *,
     image_scale: float = 1.0,
+    exposure: float = 0.0,
     progress: Progress | None = None,
 ) -> list[Finding]:
     """Read a scene as training does, and return the findings of its reading and of :func:`check_scene`.
@@ -69,13 +70,14 @@ def check_folder(
     Args:
         folder, model, images, progress: see ``read_scene``.
         image_scale: scale of the photos in training.
+        exposure: exposure in stops for photos of linear light.
 
     Returns:
         The findings, the most severe first. A scene that cannot be read is one finding.
     """
     try:
-        scene = cached_points(read_scene(folder, model, images, progress))
-        findings = [*check_scene(scene, image_scale), *_exposure(scene)]
+        scene = cached_points(read_scene(folder, model, images, progress), exposure)
+        findings = [*check_scene(scene, image_scale), *_exposure(scene, exposure)]
     except LodgsError as error:
         return [Finding(ERROR, error.what, error.remedy)]
     findings += [*_missing(scene), *_no_points(scene)]
@@ -257,13 +259,14 @@ def _groups(view: np.ndarray, point: np.ndarray, members: np.ndarray) -> list[li
     return sorted(groups.values(), key=len, reverse=True)
 
 
-def _exposure(scene: Scene) -> Iterator[Finding]:
+def _exposure(scene: Scene, exposure: float) -> Iterator[Finding]:
     """Find photos whose exposure or white balance differs from that of their neighbours."""
     try:
         from .exposures import exposure_gains
     except ImportError:
         return
-    gains = exposure_gains(scene, [camera for camera in scene.cameras if camera.name not in scene.distorted])
+    cameras = [camera for camera in scene.cameras if camera.name not in scene.distorted]
+    gains = exposure_gains(scene, cameras, exposure)
     if gains:
         deviations = {name: float(np.abs(np.log(gain)).max()) for name, gain in gains.items()}
         worst = max(deviations, key=lambda name: deviations[name])

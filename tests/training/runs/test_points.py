@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,9 +15,11 @@ from tests.training.scenes.walls import write_walls
 from training.runs import train as training_loop
 from training.runs.cells.plan import read_planned_scene
 from training.runs.data import ensure_points
+from training.runs.estimate import estimate_findings
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.scenes import triangulate
+from training.scenes.check import check_folder
 from training.scenes.colmap import read_scene
 
 
@@ -85,6 +88,17 @@ def test_resumed_run_does_not_repeat_and_has_the_same_bits(walls, tmp_path, monk
     assert run.bundle.read_bytes() == RunFolder(tmp_path / "first").bundle.read_bytes()
     job = Job(str(walls), str(tmp_path / "cells"), method="3dgs", cells="1x1")
     assert len(read_planned_scene(job).points) > triangulate.MIN_POINTS
+
+
+def test_points_for_an_exposure_are_found_before_training(walls, tmp_path, monkeypatch):
+    """The cache has a set of points for each exposure."""
+    scene = shutil.copytree(walls, tmp_path / "scene", ignore=shutil.ignore_patterns(".*"))
+    monkeypatch.setattr(triangulate.pycolmap_process, "run_program", lambda *_: "stopped by the test.")
+    job = Job(str(scene), str(tmp_path / "run"), method="3dgs", exposure=1.5, cells="1x1")
+    ensure_points(read_scene(scene), job, RunFolder(tmp_path / "run"), lambda *_, **__: None)
+    assert len(read_planned_scene(job).points)
+    assert not any("no points" in finding.what for finding in check_folder(scene, exposure=1.5))
+    assert "no points" not in estimate_findings(replace(job, cells="", backend="cpu"))[0].what
 
 
 def test_parts_of_a_read_only_scene_share_the_points(walls, tmp_path, monkeypatch):

@@ -146,17 +146,18 @@ class PlannedCell:
     memory: int
 
 
-def read_planned_scene(job: Job, add_points: Callable[[Scene], Scene] = cached_points) -> Scene:
+def read_planned_scene(job: Job, add_points: Callable[[Scene], Scene] | None = None) -> Scene:
     """Read the scene of a job with cells.
 
     Args:
-        add_points: adds points to a scene without points.
+        add_points: adds points to a scene without points; None for those in its cache.
 
     Raises:
         LodgsError: the scene cannot be read, or has no points.
     """
     model, images = job.model_and_images
-    scene = add_points(read_scene(Path(job.scene), model=model, images=images, origin=base_origin(job)))
+    scene = read_scene(Path(job.scene), model=model, images=images, origin=base_origin(job))
+    scene = add_points(scene) if add_points else cached_points(scene, job.exposure)
     if not len(scene.points):
         raise LodgsError(
             f"Cannot divide scene: the COLMAP model in {scene.model} has no 3D points.",
@@ -251,7 +252,7 @@ def write_plan(
     folder: RunFolder,
     scene: Scene | None = None,
     planned: list[PlannedCell] | None = None,
-    add_points: Callable[[Scene], Scene] = cached_points,
+    add_points: Callable[[Scene], Scene] | None = None,
 ) -> Division:
     """Write a job's parts into the run folder; keep an existing division.
 
@@ -259,7 +260,7 @@ def write_plan(
         job: the job.
         folder: its run.
         scene, planned: the job's scene and cells, if already available.
-        add_points: adds points to a scene without points.
+        add_points: see :func:`read_planned_scene`.
 
     Raises:
         LodgsError: see :func:`plan`, or the folder cannot be written.
