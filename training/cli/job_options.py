@@ -11,7 +11,7 @@ from pathlib import Path
 from ..documents import parse_json
 from ..errors import LodgsError, printable
 from ..runs.folder import RunFolder
-from ..runs.job import Job
+from ..runs.job import Job, default_image_scale
 from ..settings import settings_of
 from .options import add_setting, option_words
 
@@ -48,7 +48,7 @@ def job_from_options(options: argparse.Namespace) -> Job:
     if file and file.is_dir():
         changes = {"scene": str(file)} | changes
     elif file:
-        values = asdict(Job.from_file(file))
+        values = asdict(Job.from_file(file, changes.get("preset", "")))
     keys = values.keys() | changes.keys()
     if "out" not in keys or not keys & {"scene", "capture"}:
         raise LodgsError(
@@ -65,6 +65,8 @@ def options_of(job: Job, exclude: Collection[str] = ()) -> list[str]:
         exclude: keys to omit.
     """
     words = option_words(job, exclude)
+    if "image_scale" not in exclude and job.image_scale == Job.image_scale != default_image_scale(job.preset):
+        words += ["--image-scale", str(job.image_scale)]
     for name, value in job.parameters.items():
         words += ["--set", f"{name}={json.dumps(value)}"]
     return words

@@ -160,10 +160,13 @@ class Job:
     """Changed parameters of the preset, by name."""
 
     @classmethod
-    def from_file(cls, path: Path) -> Job:
+    def from_file(cls, path: Path, preset: str = "") -> Job:
         """Read and check a job; relative paths are relative to its folder.
 
         A started run stays in its folder even if that was moved: the job's ``out`` is ignored then.
+
+        Args:
+            preset: preset instead of the job's; keys that the job omits have its defaults.
 
         Raises:
             LodgsError: the file cannot be read, or a key or value is invalid.
@@ -180,6 +183,8 @@ class Job:
         run = RunFolder(path.parent)
         if path == run.job and run.started:
             values["out"] = "."
+        if preset:
+            values["preset"] = preset
         return cls.from_dict(values, folder=path.parent)
 
     @classmethod

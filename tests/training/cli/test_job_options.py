@@ -85,12 +85,29 @@ def test_check_of_a_run_checks_its_scene(tmp_path, capsys):
         Job("/a", "/b"),
         Job("/a b", "/b'c", "octree", "paper", seed=3, exposure=-1.5, test_every=0, validation=True,
             cells="2x3", image_scale=0.65, parameters={"levels": 3, "far_share": 0.25}),
+        Job("/a", "/b", preset="paper", image_scale=0.5),
+        Job("/a", "/b", preset="paper", image_scale=1.0),
         Job("/a", "/b", "lodge", base="/c", parameters={"distances": [8.0, 4.5, 0.0], "antialias": True}),
     ],
 )  # fmt: skip
 def test_options_of_a_job_recreate_it(values):
     assert job(*options_of(values)) == values
     assert job("--scene", "/x", *options_of(values, exclude=("scene",))) == replace(values, scene="/x")
+
+
+@pytest.mark.parametrize(
+    ("text", "preset", "scale"),
+    [
+        ("", "paper", 1.0),
+        ('preset = "paper"', "draft", 0.5),
+        ("image_scale = 0.5", "paper", 0.5),
+        ('preset = "paper"\nimage_scale = 1', "draft", 1.0),
+        ("", "standard", 0.5),
+    ],
+)
+def test_preset_of_an_option_has_its_image_scale_unless_the_file_sets_one(tmp_path, text, preset, scale):
+    (tmp_path / "a.toml").write_text(f'scene = "a"\nout = "b"\n{text}\n')
+    assert job(tmp_path / "a.toml", "--preset", preset).image_scale == scale
 
 
 def test_words_need_no_quotation_marks():
