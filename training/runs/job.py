@@ -384,7 +384,8 @@ def _is_path(f: Field, value: str) -> bool:
 def _absolute_path(key: str, value: str, folder: Path) -> str:
     """Return an absolute path; relative paths are relative to ``folder``."""
     try:
-        path = str((folder / value).expanduser().resolve())
+        home = Path(value).expanduser() if value.startswith("~") else value
+        path = str((folder / home).resolve())
     except (OSError, ValueError, RuntimeError) as error:  # NUL, unknown ~name, link cycle
         raise LodgsError(f"Invalid path {key} = {quote(value)}: {error}.", "Correct the path.") from error
     if len(path) > MAX_PATH:

@@ -21,6 +21,16 @@ def test_toml_and_json_jobs_are_equal_and_paths_are_relative_to_the_file(tmp_pat
     assert Job.from_file(toml).scene == str(tmp_path / "my scene")
 
 
+def test_home_folder_is_the_same_from_every_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path / "home"))
+    write(tmp_path / "job.toml", 'scene = "~/garden"\nout = "./~/run"\n')
+    monkeypatch.chdir(tmp_path)
+    for path in ("job.toml", tmp_path / "job.toml"):
+        job = Job.from_file(path)
+        assert job.scene == str(tmp_path / "home" / "garden") and job.out == str(tmp_path / "~" / "run")
+
+
 def test_job_with_unusual_paths_round_trips(tmp_path):
     job = Job(
         scene='/a "quoted" \\ folder/ü 日本',
