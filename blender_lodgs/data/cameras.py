@@ -22,7 +22,7 @@ from ...training.render.lens import (
 from ...training.runs.job import MIN_VIEWS
 from ...training.scenes.cameras import Camera
 from .objects import root_of
-from .placement import matrix_of, require_finite
+from .placement import matrix_of, require_finite, world_matrix
 
 ORTHOGONAL = 1e-5
 """Maximum stretch of a camera's axes without scale that counts as rounding: 0.01 pixels of 1,000."""
@@ -78,7 +78,7 @@ class RenderView:
     @classmethod
     def of(cls, obj: bpy.types.Object) -> RenderView:
         """Return the view of an evaluated camera object."""
-        return cls(obj, obj.matrix_world.copy(), obj.data.shift_x)
+        return cls(obj, world_matrix(obj), obj.data.shift_x)
 
     @property
     def world_to_camera(self) -> Matrix:

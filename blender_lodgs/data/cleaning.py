@@ -25,7 +25,7 @@ from ..attributes import BASE, HIDDEN, SCALE, SELECTION, read_attribute, view_at
 from . import changes, crops, photographs, selection
 from .cameras import UnsupportedCameraError, view_from
 from .objects import root_of
-from .placement import axes_of
+from .placement import axes_of, world_matrix
 
 Test = Callable[[bpy.types.PointCloud], np.ndarray]
 """Function from a level's point cloud to a mask (N,) bool."""
@@ -319,7 +319,7 @@ def cameras(context: bpy.types.Context, root: bpy.types.Object) -> list[Camera]:
 
 def unit_length(root: bpy.types.Object) -> float:
     """Return the length of one splat unit in the world."""
-    return max(axes_of(root).matrix_world.to_scale()) or 1.0
+    return max(world_matrix(axes_of(root)).to_scale()) or 1.0
 
 
 def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
@@ -338,7 +338,7 @@ def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
             "Import or train splats first.",
         )
     means = splat_attribute(objects[-1].data, "position")
-    matrix = np.array(axes_of(root).matrix_world, np.float64)
+    matrix = np.array(world_matrix(axes_of(root)), np.float64)
     positions = means[:: max(len(means) // 100_000, 1)] @ matrix[:3, :3].T + matrix[:3, 3]
     low, high = np.quantile(positions, (0.05, 0.95), axis=0)
     margin = 0.05 * np.maximum(high - low, 0.1 * max((high - low).max(), 1e-6))

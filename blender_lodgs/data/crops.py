@@ -18,7 +18,7 @@ from ..attributes import HIDDEN
 from ..nodes import crops as groups
 from ..nodes.building import add_modifier, find_modifier, remove_modifier, replace_driver
 from .objects import root_of
-from .placement import axes_of
+from .placement import axes_of, world_matrix
 
 DISPLAY_TYPES = {"BOX": "CUBE", "SPHERE": "SPHERE"}
 """Display types of crop empties; all other types are boxes."""
@@ -62,7 +62,7 @@ def region_object(root: bpy.types.Object, region: Crop) -> bpy.types.Object:
 
 def evaluated_crops(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Crop, ...]:
     """Return the enabled crops in the splats' space, as evaluated in the depsgraph."""
-    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    from_world = world_matrix(axes_of(root), depsgraph).inverted_safe()
     return tuple(
         evaluated_crop(obj, from_world, depsgraph) for obj in removing_crops(root) if obj.lodgs_crop.use
     )
@@ -81,7 +81,7 @@ def evaluated_crop(obj: bpy.types.Object, from_world: Matrix, depsgraph: bpy.typ
 def crop_text(root: bpy.types.Object, obj: bpy.types.Object) -> str:
     """Return a crop as text for the region of a job (``Crop.from_text``), in the splats' space."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    from_world = world_matrix(axes_of(root), depsgraph).inverted_safe()
     return evaluated_crop(obj, from_world, depsgraph).as_text()
 
 
@@ -157,7 +157,7 @@ def _crop(
     size: float, sphere: bool, outside: bool,
 ) -> Crop:  # fmt: skip
     """Return a crop in the space to which ``from_world`` transforms."""
-    matrix = np.array(from_world @ obj.evaluated_get(depsgraph).matrix_world, np.float64)
+    matrix = np.array(from_world @ world_matrix(obj, depsgraph), np.float64)
     matrix[:, :3] *= size
     return Crop.from_matrix("SPHERE" if sphere else "BOX", matrix, outside)
 

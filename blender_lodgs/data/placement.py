@@ -46,6 +46,23 @@ def lock_transform(obj: bpy.types.Object) -> None:
     obj.lock_rotation_w = obj.lock_rotations_4d = True
 
 
+def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Matrix:
+    """Return the matrix from an object's space to Blender's world, also if Blender has not evaluated it.
+
+    After a file is opened, Blender evaluates neither hidden objects nor those of other Blender scenes, and
+    their matrix is that of an object at the origin. It is then derived from their parents.
+
+    Args:
+        depsgraph: use the evaluated transform; None for the original one.
+    """
+    evaluated = obj.evaluated_get(depsgraph) if depsgraph else obj
+    matrix = evaluated.matrix_world.copy()
+    if matrix != Matrix() or obj.constraints or (obj.parent and obj.parent_type != "OBJECT"):
+        return matrix
+    local = evaluated.matrix_basis.copy()
+    return world_matrix(obj.parent, depsgraph) @ obj.matrix_parent_inverse @ local if obj.parent else local
+
+
 def matrix_in_world(root: bpy.types.Object) -> Matrix:
     """Return the matrix from a splat scene's coordinates to Blender's world.
 
@@ -69,9 +86,7 @@ def matrix_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = No
     Raises:
         LodgsError: the root is scaled differently along its axes, or its transform is not finite.
     """
-    axes = axes_of(root)
-    evaluated = axes.evaluated_get(depsgraph) if depsgraph else axes
-    matrix = np.array(evaluated.matrix_world, np.float64)
+    matrix = np.array(world_matrix(axes_of(root), depsgraph), np.float64)
     require_finite(root, matrix)
     if not is_similarity(_orthogonal(matrix)):
         raise LodgsError(

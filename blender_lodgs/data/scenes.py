@@ -28,7 +28,7 @@ from ..nodes import display, ellipsoids
 from . import cleaning, crops, looks, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
 from .photographs import camera_of, is_held_out, views, views_with_photo
-from .placement import axes_of, lock_transform, placement_of
+from .placement import axes_of, lock_transform, placement_of, world_matrix
 from .roots import levels_collection, roots
 
 
@@ -344,7 +344,7 @@ def attach_ellipsoids(scene: bpy.types.Scene) -> None:
 def _looks(root: bpy.types.Object) -> look.Looks:
     """Return the current looks of a scene."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    from_world = axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe()
+    from_world = world_matrix(axes_of(root), depsgraph).inverted_safe()
     return looks.looks_of(root, depsgraph, from_world)
 
 

@@ -317,3 +317,41 @@ def test_export_command_exports_as_placed(bpy, lodgs, root, tmp_path):
 
 def test_frame_needs_no_window(bpy, root):
     assert bpy.ops.lodgs.frame_scene() == {"FINISHED"}
+
+
+@pytest.mark.parametrize("hidden_by", ["other scene", "excluded", "collection", "objects"])
+def test_export_of_a_reopened_hidden_scene_is_placed_and_cropped(bpy, lodgs, tmp_path, hidden_by):
+    """Blender does not evaluate hidden objects after it has opened a file."""
+    from mathutils import Matrix
+
+    bundle = Bundle(
+        "made",
+        [Level(1, random_splats(80, 0), {"s_min": 0.1}), Level(2, random_splats(99, 1), {"s_min": 0.0})],
+        "bands",
+    )
+    write_bundle(tmp_path / "in.ply", bundle)
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "in.ply")
+    parent = bpy.data.objects.new("parent", None)
+    lodgs("data.roots").collection_of(root).objects.link(parent)
+    root.parent, parent.location, root.location = parent, (10, 0, 0), (0, 5, 0)
+    bpy.context.view_layer.update()
+    place = Matrix.Translation((10, 5, 0)) @ Matrix.Diagonal((0.5, 9, 9, 1))
+    crop = lodgs("data.crops").new_crop(root, "BOX", place)
+    bpy.context.view_layer.update()
+    read_levels = lodgs("data.scenes").read_levels
+    before = [level.splats.means for level in read_levels(root, placed=True).levels]
+    assert 0 < len(before[1]) < 99 and 7 < before[1][:, 0].mean() < 13
+    collection = lodgs("data.roots").collection_of(root)
+    if hidden_by == "other scene":
+        bpy.context.window.scene = bpy.data.scenes.new("other")
+    elif hidden_by == "excluded":
+        bpy.context.view_layer.layer_collection.children[collection.name].exclude = True
+    elif hidden_by == "collection":
+        collection.hide_viewport = True
+    else:
+        root.hide_viewport = crop.hide_viewport = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
+    after = [level.splats.means for level in read_levels(bpy.data.objects["in"], placed=True).levels]
+    for means, expected in zip(after, before, strict=True):
+        np.testing.assert_allclose(means, expected, atol=1e-4)
