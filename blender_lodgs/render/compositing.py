@@ -17,6 +17,7 @@ from ..data.placement import placement_of
 from ..data.properties import RenderSettings
 from ..data.property_callbacks import ON_CHANGE
 from . import engine
+from .compositor_nodes import ALPHA_OVER, MIN_DEPTH, TreeBuilder
 
 _COPIED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y",
@@ -24,20 +25,10 @@ _COPIED = (
     "fps", "fps_base", "use_multiview", "views_format", "use_motion_blur", "motion_blur_shutter",
     "motion_blur_position", "frame_map_old", "frame_map_new",
 )  # fmt: skip
-
-
-ALPHA_OVER = "CompositorNodeAlphaOver"
-MIN_DEPTH = "CompositorNodeDilateErode"
-"""Type of a node that only occurs where images are combined by depth."""
 _NODES = {
     ALPHA_OVER, MIN_DEPTH, "CompositorNodeAntiAliasing", compat.COMPOSITOR_MATH, compat.COMPOSITOR_MIX,
     "CompositorNodeZcombine", "CompositorNodePremulKey",  # of older versions
 }  # fmt: skip
-_CATCHER_REACH = 0.1
-"""Share of the depth of a shadow catcher by which splats in front of it get its shadows: the depth of a splat
-is that of its centre, which is nearer than the surface if the view grazes it."""
-_COVERED = 0.999
-"""Minimum alpha of a pixel that a mesh covers completely."""
 
 CENTER_FILTER = "BLACKMAN_HARRIS", 0.01
 """Pixel filter of Cycles with all samples at the pixel centre; the width of its box filter is fixed."""
@@ -285,7 +276,7 @@ def _build_nodes(
     centre, as in the holdout. Soft edges over a holdout would leave dark seams.
     """
     tree.nodes.clear()
-    nodes = _TreeBuilder(tree)
+    nodes = TreeBuilder(tree)
     scene.view_layers[0].use_pass_z = meshes.view_layers[0].use_pass_z = True  # before nodes with its socket
     for layer in meshes.view_layers:
         layer.cycles.use_pass_shadow_catcher = layer.name == catchers
@@ -304,83 +295,6 @@ def _build_nodes(
         result = nodes.mix(near, result, nodes.over(mesh_image, splat_image))
     _sample_meshes(meshes, soft=by_depth)
     tree.links.new(result, compat.compositor_output(tree))
-
-
-class _TreeBuilder:
-    """Builder of compositor nodes, from left to right."""
-
-    def __init__(self, tree: bpy.types.NodeTree) -> None:
-        self._tree = tree
-        self._x = 0
-
-    def render_layer(self, scene: bpy.types.Scene, layer: str, row: int) -> bpy.types.Node:
-        """Add the images of a view layer."""
-        node = self._tree.nodes.new("CompositorNodeRLayers")
-        node.location = (0, -420 * row)
-        node.scene, node.layer, node.label = scene, layer, scene.name
-        return node
-
-    def over(self, front: bpy.types.NodeSocket, back: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        """Add a node that places an image over another one."""
-        node = self._add(ALPHA_OVER)
-        background, foreground = (socket for socket in node.inputs if socket.type == "RGBA")
-        self._tree.links.new(back, background)
-        self._tree.links.new(front, foreground)
-        return node.outputs[0]
-
-    def mix(
-        self,
-        factor: bpy.types.NodeSocket | float,
-        first: bpy.types.NodeSocket,
-        second: bpy.types.NodeSocket,
-        blend: str = "MIX",
-    ) -> bpy.types.NodeSocket:
-        """Add a node that mixes or multiplies two images; the alpha is that of the first."""
-        node = self._add(compat.COMPOSITOR_MIX)
-        node.blend_type = blend
-        if hasattr(node, "data_type"):
-            node.data_type = "RGBA"
-        sockets = [node.inputs[0], *(socket for socket in node.inputs if socket.type == "RGBA")]
-        self._connect(sockets, factor, first, second)
-        return next(socket for socket in node.outputs if socket.type == "RGBA")
-
-    def nearer(self, front: bpy.types.Node, back: bpy.types.Node) -> bpy.types.NodeSocket:
-        """Add nodes that return 1 where a layer of meshes is nearer than another layer.
-
-        Where a mesh covers a part of a pixel, the pixel's depth is that of the mesh or of the background. The
-        smallest depth of the neighbouring pixels is that of the mesh.
-        """
-        depth, other_depth = front.outputs["Depth"], back.outputs["Depth"]
-        smallest = self._add(MIN_DEPTH, depth)
-        smallest.inputs["Size"].default_value = -1
-        near = self._add("CompositorNodeAntiAliasing", self._math("LESS_THAN", depth, other_depth))
-        edge_near = self._math("LESS_THAN", smallest.outputs[0], other_depth)
-        edge = self._math("LESS_THAN", front.outputs["Alpha"], _COVERED)
-        return self._math("MAXIMUM", near.outputs[0], self._math("MULTIPLY", edge_near, edge))
-
-    def is_near_catcher(self, catcher: bpy.types.Node, splats: bpy.types.Node) -> bpy.types.NodeSocket:
-        """Add nodes that return 1 where splats are not far in front of a layer with a shadow catcher."""
-        depth = self._math("MULTIPLY", catcher.outputs["Depth"], 1 - _CATCHER_REACH)
-        return self._math("LESS_THAN", depth, splats.outputs["Depth"])
-
-    def _math(self, operation: str, *sources: bpy.types.NodeSocket | float) -> bpy.types.NodeSocket:
-        node = self._add(compat.COMPOSITOR_MATH, *sources)
-        node.operation = operation
-        return node.outputs[0]
-
-    def _add(self, kind: str, *sources: bpy.types.NodeSocket | float) -> bpy.types.Node:
-        node = self._tree.nodes.new(kind)
-        self._x += 200
-        node.location = (200 + self._x, -self._x % 400)
-        self._connect(node.inputs, *sources)
-        return node
-
-    def _connect(self, sockets, *sources: bpy.types.NodeSocket | float) -> None:
-        for source, socket in zip(sources, sockets, strict=False):
-            if isinstance(source, bpy.types.NodeSocket):
-                self._tree.links.new(source, socket)
-            else:
-                socket.default_value = source
 
 
 def _sample_meshes(meshes: bpy.types.Scene, soft: bool) -> None:
