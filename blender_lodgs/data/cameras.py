@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,11 +54,18 @@ def enabled_cameras(scene: bpy.types.Scene, root: bpy.types.Object | None = None
     cameras = [
         obj
         for obj in scene.objects
-        if obj.type == "CAMERA"
-        and not (obj.hide_render or all(part.hide_render for part in obj.users_collection))
-        and (root is None or root_of(obj) in (None, root))
+        if obj.type == "CAMERA" and not obj.hide_render and (root is None or root_of(obj) in (None, root))
     ]
-    return sorted(cameras, key=lambda obj: obj.name)
+    rendered = {obj for layer in scene.view_layers for obj in _rendered_objects(layer.layer_collection)}
+    return sorted(rendered.intersection(cameras), key=lambda obj: obj.name)
+
+
+def _rendered_objects(layer: bpy.types.LayerCollection) -> Iterator[bpy.types.Object]:
+    """Yield the objects of a collection and those below it, without disabled and excluded collections."""
+    if not layer.collection.hide_render:
+        yield from () if layer.exclude else layer.collection.objects
+        for child in layer.children:
+            yield from _rendered_objects(child)
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,19 @@ def test_photo_camera_replaces_the_startup_camera(bpy, lodgs):
     assert viewpoints.view_count(root.lodgs.training) == len(photos)
 
 
+@pytest.mark.parametrize("disabled", ["hide_render", "exclude"])
+def test_cameras_of_a_disabled_collection_are_not_used(bpy, lodgs, disabled):
+    outer, inner = (bpy.data.collections.new(name) for name in ("outer", "inner"))
+    bpy.context.scene.collection.children.link(outer)
+    outer.children.link(inner)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    inner.objects.link(camera)
+    cameras, layer = lodgs("data.cameras"), bpy.context.view_layer.layer_collection.children["outer"]
+    assert cameras.enabled_cameras(bpy.context.scene) == [camera]
+    setattr(outer if disabled == "hide_render" else layer, disabled, True)
+    assert cameras.enabled_cameras(bpy.context.scene) == []
+
+
 def test_invalid_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
