@@ -335,3 +335,27 @@ def supported_views(
         frames = ", ".join(str(shot) for shot in skipped if isinstance(shot, int))
         warn(f"{error.what} {f'Frames {frames} are' if frames else 'It is'} left out. {error.remedy}")
     return views
+
+
+def views_of_cameras(
+    context: bpy.types.Context,
+    cameras: Iterable[bpy.types.Object],
+    view_in: Callable[[bpy.types.Depsgraph, bpy.types.Object], tuple[Camera, float]],
+    warn: Callable[[str], object],
+) -> list[tuple[Any, tuple[Camera, float]]]:
+    """Return :func:`supported_views` of camera objects, also of cameras that are hidden in viewports.
+
+    Args:
+        view_in: function that returns the view and the clip start of a camera in an evaluated depsgraph.
+    """
+    scene, active = context.scene, context.scene.camera
+
+    def view_of_camera(camera: bpy.types.Object) -> tuple[Camera, float]:
+        if not camera.visible_get():
+            scene.camera = camera  # the only hidden camera that Blender evaluates
+        return view_in(context.evaluated_depsgraph_get(), camera)
+
+    try:
+        return supported_views(cameras, view_of_camera, warn)
+    finally:
+        scene.camera = active

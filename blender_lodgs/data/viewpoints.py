@@ -27,7 +27,7 @@ from ...training.scenes.viewpoints import (
 from ...training.splats.gaussians import Splats
 from .. import attributes
 from . import changes
-from .cameras import enabled_cameras, scene_camera, supported_views, view_from, view_of
+from .cameras import enabled_cameras, scene_camera, supported_views, view_from, view_of, views_of_cameras
 from .objects import root_of
 from .placement import matrix_of
 from .setting_properties import property_of
@@ -169,9 +169,8 @@ def training_views(
     match settings.views_from:
         case "CAMERAS":
             cameras = _require_two(enabled_cameras(context.scene, root))
-            depsgraph = context.evaluated_depsgraph_get()
-            views = supported_views(
-                cameras, lambda camera: view_from(root, depsgraph, width, height, camera), warn
+            views = views_of_cameras(
+                context, cameras, lambda graph, camera: view_from(root, graph, width, height, camera), warn
             )
             return [view for _, view in views]
         case "ANIMATION":
@@ -223,8 +222,7 @@ def _shots_with_views(
     match settings.views_from:
         case "CAMERAS":
             cameras = _require_two([obj for obj in enabled_cameras(scene) if root_of(obj) is None])
-            depsgraph = context.evaluated_depsgraph_get()
-            return supported_views(cameras, lambda camera: evaluated_view(depsgraph, camera), warn)
+            return views_of_cameras(context, cameras, evaluated_view, warn)
         case "ANIMATION":
             frames = _frames(scene, settings.views)
             return _animated(

@@ -194,6 +194,29 @@ def test_cameras_of_a_disabled_collection_are_not_used(bpy, lodgs, disabled):
     assert cameras.enabled_cameras(bpy.context.scene) == []
 
 
+@pytest.mark.parametrize("hidden", [False, True])
+def test_views_of_hidden_cameras_of_a_reopened_file(bpy, lodgs, tmp_path, hidden):
+    """Blender evaluates no hidden cameras except the active one."""
+    collection, target = bpy.data.collections.new("cameras"), bpy.data.objects.new("target", None)
+    bpy.context.scene.collection.children.link(collection)
+    bpy.context.scene.collection.objects.link(target)
+    for number in range(3):
+        camera = bpy.data.objects.new(f"camera {number}", bpy.data.cameras.new("camera"))
+        collection.objects.link(camera)
+        camera.location = (5 + number, 1, 2)
+        camera.constraints.new("TRACK_TO").target = target
+    bpy.context.scene.camera, bpy.context.scene.lodgs_capture.views_from = camera, "CAMERAS"
+    bpy.context.view_layer.update()
+    expected = [np.array(camera.matrix_world.inverted())[2] for camera in collection.objects]
+    collection.hide_viewport = hidden
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
+    views = lodgs("data.viewpoints").capture_views(bpy.context, 64, 48)
+    for (view, _), backward in zip(views, expected, strict=True):
+        np.testing.assert_allclose(view.world_to_camera[2], -backward, atol=1e-5)
+    assert bpy.context.scene.camera.name == "camera 2"
+
+
 def test_invalid_control_changes_nothing(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("mine", [Level(1, ball(5, 0))]))
     root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
