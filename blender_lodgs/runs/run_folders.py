@@ -34,13 +34,13 @@ def run_folder(root: bpy.types.Object) -> RunFolder | None:
         LodgsError: its path names a device.
     """
     run = root.lodgs.training.run
-    return RunFolder(absolute_path(run)) if run else None
+    return RunFolder(absolute_path(run).resolve()) if run else None
 
 
 def automatic_run(root: bpy.types.Object) -> RunFolder | None:
     """Return the folder of the root's newest run, or None as ``automatic_path``."""
     path = automatic_path(root.lodgs.training.run)
-    return RunFolder(path) if path else None
+    return RunFolder(path.resolve()) if path else None
 
 
 def cost_plot(root: bpy.types.Object) -> Path | None:
@@ -110,7 +110,7 @@ def find_runs(root: bpy.types.Object) -> list[RunRecord]:
     output = root.lodgs.training.output
     parents = {current.path.parent} if current else set()
     if not output or automatic_path(output):
-        parents.add(runs_parent(root))
+        parents.add(runs_parent(root).resolve())
     scene = automatic_path(root.lodgs.scene_folder)
     records = {}
     for parent in parents:
@@ -119,7 +119,7 @@ def find_runs(root: bpy.types.Object) -> list[RunRecord]:
                 run = RunFolder(file.parent)
                 job = Job.from_file(file)
                 is_current = current is not None and run.path == current.path
-                if is_current or (scene is not None and job.scene and Path(job.scene) == scene):
+                if is_current or (scene and job.scene and Path(job.scene).resolve() == scene.resolve()):
                     records[run.path] = RunRecord(run, job, run.state())
     return [records[path] for path in sorted(records)]
 

@@ -1,5 +1,6 @@
 """The menus list every operator, the status bar shows background work, and the runs menu switches runs."""
 
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -189,6 +190,14 @@ def test_runs_of_a_scene_are_listed_and_opened(bpy, lodgs, tmp_path, fake):
     assert run_folders.run_folder(root).path == first.folder.path and any(
         item.exists for item in root.lodgs.levels
     )
+    (tmp_path / "blends").mkdir()
+    root.lodgs.scene_folder = "//" + os.path.relpath(GARDEN, tmp_path / "blends")
+    root.lodgs.training.run = "//../runs/" + first.folder.path.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "blends" / "b.blend"))
+    assert len(run_folders.find_runs(root)) == 2
+    layout.operators.clear()
+    lodgs("panels.menus").LODGS_MT_runs.draw(SimpleNamespace(layout=layout), bpy.context)
+    assert [icon for _, _, icon, _ in layout.operators] == ["RADIOBUT_ON", "RADIOBUT_OFF"]
 
 
 @pytest.mark.parametrize(
