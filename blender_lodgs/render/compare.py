@@ -7,7 +7,7 @@ Images and PSNR come from the renderer, at the size of the training images and w
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import bpy
 import numpy as np
@@ -160,7 +160,8 @@ class Measurement:
         try:
             if root is not None and self.running and self.done < self.total:
                 view = objects.get(self._views[self.done])
-                comparison = None if view is None else compare_view(bpy.context, root, view)
+                with _in_scene_of(root):
+                    comparison = None if view is None else compare_view(bpy.context, root, view)
                 if comparison is not None:
                     self._psnr[comparison.view] = comparison.psnr
                 self.done += 1
@@ -179,6 +180,14 @@ class Measurement:
     def cancel(self) -> None:
         """Stop after the current view."""
         self.running = False
+
+
+def _in_scene_of(root: bpy.types.Object):
+    """Return a context manager that makes a Blender scene of a root the current one, if it is not."""
+    if root.name in bpy.context.scene.objects or not root.users_scene:
+        return nullcontext()
+    scene = root.users_scene[0]
+    return bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0])
 
 
 measurement: Measurement | None = None

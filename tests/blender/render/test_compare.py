@@ -53,6 +53,21 @@ def read_photo(bpy, view) -> np.ndarray:
     return values.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
 
 
+def test_measuring_continues_in_another_blender_scene(bpy, lodgs, root, monkeypatch):
+    """The user may show another scene meanwhile, which has no splats."""
+    drawn = []
+    monkeypatch.setattr(
+        lodgs("render.renderer"), "draw_frame", lambda sets, view, on_progress: drawn.append(len(sets))
+    )
+    measurement = lodgs("render.compare").measure(bpy.context, root)
+    camera = bpy.context.scene.camera
+    measurement.step()
+    bpy.context.window.scene = bpy.data.scenes.new("other")
+    measurement.step()
+    assert drawn == [1, 1]
+    assert bpy.context.scene.camera is None and root.users_scene[0].camera == camera
+
+
 def test_psnr_matches_a_render(bpy, lodgs, root, renderer, tmp_path):
     scene, view = bpy.context.scene, lodgs("data.photographs").views(root)[5]
     lodgs("data.photographs").use_view(bpy.context, view)
