@@ -14,6 +14,7 @@ import bpy
 from ...training.errors import LodgsError
 from ...training.runs.job import Job
 from ...training.scenes.check import ESTIMATE, SEVERITIES, Finding, check_folder
+from .. import extension
 from ..data.paths import absolute_path
 from ..data.training_settings import hold_out_interval
 from . import environment, job_settings, run_folders
@@ -94,8 +95,10 @@ def last_estimate(root: bpy.types.Object) -> list[str]:
 
 
 def settings_key(root: bpy.types.Object) -> str:
-    """Return a text that changes with the settings of the training."""
+    """Return a text that changes with the settings of the training and its device."""
     settings = root.lodgs.training
     changed = sorted(job_settings.changed_parameters(settings).items())
-    common = settings.method, settings.preset, settings.image_scale, settings.start_from
-    return repr((*common, settings.grid, settings.region, hold_out_interval(root), changed))
+    common = settings.method, settings.preset, settings.image_scale, settings.start_from, settings.base
+    files = root.lodgs.scene_folder, settings.model, settings.images
+    grid, region, every = settings.grid, settings.region, hold_out_interval(root)
+    return repr((*common, *files, grid, region, every, changed, extension.preferences().backend))
