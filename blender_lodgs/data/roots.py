@@ -17,6 +17,12 @@ def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return [obj for obj in scene.objects if obj.lodgs.is_root]
 
 
+def all_roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Return the roots of the splat scenes in a Blender scene, also in collection instances."""
+    instanced = [root for obj in scene.objects for root in _instanced_roots(obj)]
+    return list(dict.fromkeys([*roots(scene), *instanced]))
+
+
 def active_root(context: bpy.types.Context) -> bpy.types.Object | None:
     """Return the root of the active object's splat scene, or else the only root of the Blender scene."""
     root = root_of(context.active_object)

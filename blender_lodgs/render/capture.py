@@ -188,7 +188,7 @@ def _prepare(scene: bpy.types.Scene, width: int, height: int) -> None:
         for node in tree.nodes:
             if node.bl_idname == "CompositorNodeOutputFile":
                 node.mute = True
-    for root in roots.roots(scene):
+    for root in roots.all_roots(scene):
         for obj in root.children_recursive:
             obj.driver_remove("hide_render")  # the driver would show a level
             obj.hide_render = True

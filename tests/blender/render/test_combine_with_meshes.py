@@ -167,3 +167,19 @@ def test_captures_hide_splats(bpy, lodgs, scene):
     lodgs("render.capture")._prepare(scene, 64, 48)
     bpy.context.view_layer.update()  # evaluates drivers
     assert [level.object.hide_render for level in root.lodgs.levels] == [True]
+
+
+def test_captures_hide_instances_of_linked_splats(bpy, lodgs, scene, tmp_path):
+    [root] = lodgs("data.roots").roots(scene)
+    name = lodgs("data.roots").levels_collection(root).name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, linked):
+        linked.collections = [name]
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type, instance.instance_collection = "COLLECTION", linked.collections[0]
+    bpy.context.scene.collection.objects.link(instance)
+    bpy.context.view_layer.update()
+    lodgs("render.capture")._prepare(bpy.context.scene, 64, 48)
+    bpy.context.view_layer.update()
+    assert [obj.hide_render for obj in linked.collections[0].objects] == [True]
