@@ -64,7 +64,9 @@ def evaluated_crops(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> t
     """Return the enabled crops in the splats' space, as evaluated in the depsgraph."""
     from_world = world_matrix(axes_of(root), depsgraph).inverted_safe()
     return tuple(
-        evaluated_crop(obj, from_world, depsgraph) for obj in removing_crops(root) if obj.lodgs_crop.use
+        evaluated_crop(obj, from_world, depsgraph)
+        for obj in removing_crops(root)
+        if obj.evaluated_get(depsgraph).lodgs_crop.use
     )
 
 
@@ -74,8 +76,12 @@ def evaluated_crop(obj: bpy.types.Object, from_world: Matrix, depsgraph: bpy.typ
     Args:
         from_world: matrix from the world to the space of the result.
     """
-    sphere = obj.empty_display_type == DISPLAY_TYPES["SPHERE"]
-    return _crop(from_world, obj, depsgraph, obj.empty_display_size, sphere, obj.lodgs_crop.keep == "OUTSIDE")
+    evaluated = obj.evaluated_get(depsgraph)
+    sphere, outside = (
+        evaluated.empty_display_type == DISPLAY_TYPES["SPHERE"],
+        evaluated.lodgs_crop.keep == "OUTSIDE",
+    )
+    return _crop(from_world, obj, depsgraph, evaluated.empty_display_size, sphere, outside)
 
 
 def crop_text(root: bpy.types.Object, obj: bpy.types.Object) -> str:

@@ -93,11 +93,11 @@ def looks_of(
     if root_look != NEUTRAL:
         placed_looks.append(PlacedLook(None, root_look))
     for obj in regions_of(root):
-        settings = obj.evaluated_get(depsgraph).lodgs_look
-        look = _read_look(settings)
-        if obj.lodgs_crop.use and look != NEUTRAL:
+        evaluated = obj.evaluated_get(depsgraph)
+        look = _read_look(evaluated.lodgs_look)
+        if evaluated.lodgs_crop.use and look != NEUTRAL:
             crop = crops.evaluated_crop(obj, from_world, depsgraph)
-            placed_looks.append(PlacedLook(replace(crop, outside=settings.outside), look))
+            placed_looks.append(PlacedLook(replace(crop, outside=evaluated.lodgs_look.outside), look))
     return tuple(placed_looks)
 
 

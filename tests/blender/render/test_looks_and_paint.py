@@ -9,6 +9,7 @@ from tests.training.editing.test_cleaning import bundle_of
 from tests.training.lod.tree.trees import random_leaves, tree_of, write_in_pages
 from training.color import srgb_from_linear
 from training.editing.look import Look
+from training.render.image import RenderedImage
 from training.splats.bundle import write_bundle
 
 GLOBAL_LOOK = Look(0.4, 5000, (1.0, 0.9, 0.7), 0.6, 0.8)
@@ -247,3 +248,30 @@ def test_ellipsoids_have_the_colour_and_opacity_of_the_look(bpy, lodgs, tmp_path
             lodgs("data.removal").remove(root)
     assert 0.5 < images[0][..., 3].max() < 0.7  # 0.8 * 0.82
     np.testing.assert_allclose(*images, atol=0.02)
+
+
+@pytest.mark.usefixtures("camera")
+def test_animated_regions_change_in_an_animation(bpy, lodgs, tmp_path, monkeypatch):
+    """Renders evaluate animations in a depsgraph of their own."""
+    root = lodgs("data.importing").import_splats(bpy.context, write_splats(tmp_path))
+    bpy.context.view_layer.objects.active = root
+    sphere, scene = add_looks(bpy, root), bpy.context.scene
+    for frame, use, size in ((1, True, 1.0), (2, True, 2.0), (3, False, 2.0)):
+        sphere.lodgs_crop.use, sphere.empty_display_size = use, size
+        sphere.lodgs_crop.keyframe_insert("use", frame=frame)
+        sphere.keyframe_insert("empty_display_size", frame=frame)
+    scene.frame_set(1)
+    lodgs("render.engine").use(scene)
+    scene.render.filepath, scene.frame_start, scene.frame_end = str(tmp_path / "frame_"), 1, 3
+    renderer, looks = lodgs("render.renderer"), []
+
+    def draw_frame(sets, view, on_progress):
+        looks.append(sets[0].looks)
+        image = RenderedImage.empty(view.camera.width, view.camera.height, None)
+        return renderer.RenderedFrame(image.passes(), float("nan"))
+
+    monkeypatch.setattr(renderer, "draw_frame", draw_frame)
+    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
+    assert [len(frame) for frame in looks] == [2, 2, 1]
+    first, second = (np.array(frame[1].crop.to_local)[:, :3] for frame in looks[:2])
+    np.testing.assert_allclose(first, 2 * second, rtol=1e-5, atol=1e-8)
