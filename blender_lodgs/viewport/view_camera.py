@@ -26,8 +26,9 @@ PAUSE = 0.08
 REST = 0.25
 """Seconds without movement after which a view rests."""
 
-_matrices: dict[int, Matrix] = {}
-"""World to clip space of each viewport's region at its last redraw."""
+_matrices: dict[int, dict[int, Matrix]] = {}
+"""World to clip space of each viewport's region at its last redraw, by ``session_uid`` of the scene: windows
+may show different ones."""
 _pending: tuple[str, Position, float] | None = None
 """Most recently moved view that is not stored yet: scene name, camera position in the world, focal length."""
 _due = 0.0
@@ -85,14 +86,14 @@ def track(
     """
     global _pending, _due
     if not any(_follows(root) for root in roots.roots(scene)):
-        _matrices.clear()
+        _matrices.pop(scene.session_uid, None)
         return
     matrix = view.window_matrix @ view.view_matrix
-    key = region.as_pointer()
-    if key in _matrices and _matrices[key] == matrix:
+    key, matrices = region.as_pointer(), _matrices.setdefault(scene.session_uid, {})
+    if key in matrices and matrices[key] == matrix:
         return
-    newly_opened = bool(_matrices) and key not in _matrices
-    _matrices[key] = matrix
+    newly_opened = bool(matrices) and key not in matrices
+    matrices[key] = matrix
     if newly_opened:  # it has not moved
         return
     _pending = (

@@ -386,3 +386,25 @@ def test_moving_view_selects_before_modifiers_update(bpy, lodgs, draw_from, scen
     view_camera.track(region, bpy.context.scene, region_view, splats=True)
     assert view_camera.current_camera(bpy.context.scene, scene) is None
     view_camera.clear()
+
+
+def test_a_window_of_another_scene_moves_no_view(bpy, lodgs, scene):
+    from mathutils import Matrix
+
+    view_camera = lodgs("viewport.view_camera")
+    scene.lodgs.camera_choice = "VIEW"
+    other = bpy.data.scenes.new("other")
+
+    def track(blender_scene, number):
+        view = SimpleNamespace(
+            view_matrix=Matrix.Translation((number, 0, 0)), window_matrix=Matrix(), view_distance=1.0
+        )
+        view_camera.track(SimpleNamespace(as_pointer=lambda: number, width=100), blender_scene, view)
+
+    track(bpy.context.scene, 1)
+    track(bpy.context.scene, 2)
+    camera = view_camera.current_camera(bpy.context.scene, scene)
+    track(other, 3)
+    track(bpy.context.scene, 2)
+    assert camera is not None and view_camera.current_camera(bpy.context.scene, scene) == camera
+    view_camera.clear()
