@@ -12,6 +12,11 @@ LINKED = (
 )
 
 
+def is_local(root: bpy.types.Object) -> bool:
+    """Return False if a splat scene is linked, or overrides a linked one: changes of it are not saved."""
+    return root.is_editable and root.override_library is None
+
+
 def roots(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """Return the roots of the splat scenes in a Blender scene."""
     return [obj for obj in scene.objects if obj.lodgs.is_root]
@@ -45,7 +50,7 @@ def is_linked(context: bpy.types.Context) -> bool:
     """Return True if the active splat scene, or one in the selected instance, is linked from another file."""
     root, obj = active_root(context), context.active_object
     candidates = [root] if root is not None else [] if obj is None else _instanced_roots(obj)
-    return any(not candidate.is_editable for candidate in candidates)
+    return not all(map(is_local, candidates))
 
 
 def _instanced_roots(obj: bpy.types.Object) -> list[bpy.types.Object]:

@@ -89,9 +89,9 @@ class SceneOperator:
         root = roots.active_root(context)
         if root is None:
             cls.poll_message_set("Select or import a splat scene first")  # type: ignore[attr-defined]
-        elif not root.is_editable:
+        elif not roots.is_local(root):
             cls.poll_message_set(roots.LINKED)  # type: ignore[attr-defined]
-        return root is not None and root.is_editable
+        return root is not None and roots.is_local(root)
 
 
 class ReadLevelsOperator:

@@ -16,7 +16,7 @@ class LODGS_PT_look(LevelsPanel):
 
     @classmethod
     def poll(cls, context):
-        return super().poll(context) and roots.active_root(context).is_editable
+        return super().poll(context) and roots.is_local(roots.active_root(context))
 
     def draw(self, context):
         layout, root = self.layout, roots.active_root(context)

@@ -16,7 +16,7 @@ class LODGS_PT_placement(Panel):
     @classmethod
     def poll(cls, context):
         root = roots.active_root(context)
-        return root is not None and root.is_editable
+        return root is not None and roots.is_local(root)
 
     def draw(self, context):
         layout = self.layout

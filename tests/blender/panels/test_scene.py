@@ -173,6 +173,30 @@ def test_linked_scene_can_be_rendered_but_not_changed(
     assert "splats" in draw_panel("viewport", "LODGS_PT_viewport").properties
 
 
+def test_library_override_cannot_be_changed(bpy, lodgs, root, draw_panel, tmp_path):
+    """Blender does not save settings of extensions in overrides, and the points remain linked."""
+    roots = lodgs("data.roots")
+    name = roots.collection_of(root).name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "garden.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "garden.blend"), link=True) as (_, linked):
+        linked.collections = [name]
+    scene, [collection] = bpy.context.scene, linked.collections
+    scene.collection.children.link(collection)
+    collection.override_hierarchy_create(scene, bpy.context.view_layer)
+    scene.collection.children.unlink(collection)
+    [override] = roots.roots(scene)
+    bpy.context.view_layer.objects.active = override
+    assert override.is_editable and roots.LINKED in draw_panel("scene", "LODGS_PT_scene").texts
+    for operator in ("remove_scene", "show_only_level", "train", "set_ground"):
+        assert not getattr(bpy.ops.lodgs, operator).poll()
+    for obj in scene.objects:
+        obj.select_set(True)
+    assert bpy.ops.object.make_local(type="ALL") == {"FINISHED"}
+    bpy.context.view_layer.objects.active = scene.objects[name]
+    assert roots.is_local(scene.objects[name]) and bpy.ops.lodgs.remove_scene.poll()
+
+
 def test_local_scene_has_no_hint_about_linking(lodgs, root, draw_panel):
     layout = draw_panel("scene", "LODGS_PT_scene")
     assert lodgs("data.roots").LINKED not in layout.texts and "lodgs.remove_scene" in layout.operators
