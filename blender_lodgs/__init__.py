@@ -10,7 +10,7 @@ from . import commands, operators, panels, viewport
 from .data import (
     changes,
     clutter,
-    loaded,
+    detail,
     looks,
     older_files,
     paths,
@@ -36,7 +36,7 @@ MODULES = (
     *panels.MODULES,
     older_files,
     scenes,
-    loaded,
+    detail,
     removal,
     reloading,
     conversion,

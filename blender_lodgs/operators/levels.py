@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.errors import LodgsError
-from ..data import loaded, roots, scenes
+from ..data import detail, roots, scenes
 from .base import SceneOperator, report_errors
 
 
@@ -48,7 +48,7 @@ class LODGS_OT_reduce_detail(SceneOperator, bpy.types.Operator):
         mode, root.lodgs.mode = root.lodgs.mode, "SELECTIVE"
         context.view_layer.update()
         try:
-            saved = loaded.reduce_detail(context, root, self.share)
+            saved = detail.reduce_detail(context, root, self.share)
         except LodgsError:
             root.lodgs.mode = mode
             raise

@@ -8,7 +8,7 @@ import bpy
 
 from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule_error
-from ..data import loaded, objects, roots, scenes, selection, streams
+from ..data import detail, objects, roots, scenes, selection, streams
 from ..nodes.camera_choices import find_choice
 from ..viewport import views
 from .parts import LevelsPanel, say, sidebar_width, split_column
@@ -43,11 +43,11 @@ class LODGS_UL_levels(bpy.types.UIList):
         row = layout.row(align=True)
         row.prop(item, "show", text="", icon="HIDE_OFF" if item.show else "HIDE_ON", emboss=False)
         cloud = item.object.data
-        facts = selection.read_facts(item.facts).values()
-        detail = " ".join(f"{value:.2g}" if value else "all" for value in facts)  # 0: no splat is too small
-        _columns(
-            row, str(item.number), _short(len(cloud.points)), _short(objects.megabytes(cloud), 1), detail
+        facts = " ".join(
+            f"{value:.2g}" if value else "all"  # 0: no splat is too small
+            for value in selection.read_facts(item.facts).values()
         )
+        _columns(row, str(item.number), _short(len(cloud.points)), _short(objects.megabytes(cloud), 1), facts)
         solo = data.mode == "SINGLE" and data.single_level == item.number
         row = row.row(align=True)
         row.enabled = data.complete or item.number == data.levels[-1].number
@@ -106,7 +106,7 @@ class LODGS_PT_detail(LevelsPanel):
             row.enabled = settings.complete
             row.prop(settings, "single_level")
         else:
-            query = loaded.current_query(context, root)
+            query = detail.current_query(context, root)
             inactive = query.inactive_controls() if query else {}
             for control in rule.controls if rule else ():
                 row = column.row()
@@ -133,7 +133,7 @@ class LODGS_PT_detail(LevelsPanel):
 
 def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
     """Draw the camera's chunk and the numbers of visible and loaded splats."""
-    query = loaded.current_query(context, root) if root.lodgs.mode == "SELECTIVE" else None
+    query = detail.current_query(context, root) if root.lodgs.mode == "SELECTIVE" else None
     column = layout.column(align=True)
     region = query.region_label() if query else ""
     if region:
@@ -142,13 +142,13 @@ def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: b
         visible, total = scenes.count_visible(context, root)
         say(column, f"{visible:,} of {total:,} splats shown", "NONE")
         if query:
-            saved = loaded.saved_share(context, root)
+            saved = detail.saved_share(context, root)
             say(column, f"{saved:.0%} fewer than the finest level", "NONE")
             if saved < MIN_SAVED and len(root.lodgs.levels) > 1:
                 say(column, "By Distance saves almost nothing at this camera.", "INFO")
                 column.operator("lodgs.reduce_detail")
     if query and region:
-        splats, megabytes = loaded.count_loaded(root, query)
+        splats, megabytes = detail.count_loaded(root, query)
         say(column, f"{splats:,} loaded, {megabytes:.1f} MB", "NONE")
 
 

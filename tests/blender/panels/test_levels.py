@@ -124,14 +124,14 @@ def test_chunk_of_the_camera_and_loaded_splats_are_shown(bpy, lodgs, town, draw)
 
 
 def test_loaded_splats_are_counted_again_when_splats_change(bpy, lodgs, town):
-    loaded, cloud = lodgs("data.loaded"), town.lodgs.levels[1].object.data
+    detail, cloud = lodgs("data.detail"), town.lodgs.levels[1].object.data
     bpy.context.view_layer.update()
-    query = loaded.current_query(bpy.context, town)
-    assert loaded.count_loaded(town, query)[0] == 110
+    query = detail.current_query(bpy.context, town)
+    assert detail.count_loaded(town, query)[0] == 110
     lodgs("attributes").write_attribute(cloud, "chunks_0", "FLOAT", np.ones(1000, np.float32))
     cloud.update_tag()
     bpy.context.view_layer.update()
-    assert loaded.count_loaded(town, query)[0] == 1010
+    assert detail.count_loaded(town, query)[0] == 1010
 
 
 def test_chunks_can_be_shown_as_spheres_and_colours(town, draw, draw_panel, root):

@@ -1,4 +1,4 @@
-"""Current camera of a splat scene, and the numbers of splats that it shows, loads and saves, for panels."""
+"""Detail by distance: its current camera, and the splats that it draws, loads and saves."""
 
 from __future__ import annotations
 
