@@ -132,9 +132,7 @@ def _draw() -> None:
     assert comparison is not None
     left, bottom, right, top = view_camera.camera_frame(camera, scene, view.window_matrix)
     width = region.width * (right - left) / 2
-    draw(
-        comparison, scene.lodgs_render.wipe, [(left, bottom), (right, top)], 0.75 / max(width, 1)
-    )  # fmt: skip
+    draw(comparison, scene.lodgs_render.wipe, [(left, bottom), (right, top)], 0.75 / max(width, 1))
 
 
 def is_shown(context: bpy.types.Context) -> bool:

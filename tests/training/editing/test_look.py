@@ -187,7 +187,7 @@ def test_command_edits_regions_and_folders(tmp_path, capsys):
         (box, "--keep all"),
         (["--opacity", "2"], "opacity = 2.0 is invalid. Use a number of at least 0 and at most 1."),
         (["--tint", "1", "1", "7"], "tint = 7.0 is invalid"),
-    ):  # fmt: skip
+    ):
         out.unlink(missing_ok=True)
         assert main([*command, *wrong]) == 2 and not out.exists()
         assert text in capsys.readouterr().err

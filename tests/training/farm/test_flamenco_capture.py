@@ -62,7 +62,7 @@ def test_commands_of_the_tasks_give_the_same_scene_as_one_command(tmp_path, monk
     blend, farm, single = tmp_path / "scene.blend", tmp_path / "farm", tmp_path / "single"
     tasks = compiled(
         tmp_path, SCRIPT, blendfile=str(blend), output=str(farm), views=5, chunk=2, width=64, height=48
-    )["tasks"]  # fmt: skip
+    )["tasks"]
     assert len(tasks) == 4
     commands = [command["args"] for task in tasks for command in task["commands"]]
     commands.append([str(single) if word == str(farm) else word for word in commands[-1]])

@@ -72,9 +72,7 @@ def test_coarser_level_of_a_tree_is_refused(camera, make_splats, tmp_path, capsy
     write_camera(tmp_path / "camera.json", camera, 0.01)
     command = ["render", str(tmp_path / "tree.ply"), "--camera", str(tmp_path / "camera.json"), "--out"]
     assert main([*command, str(tmp_path / "full.png")]) == 0
-    np.testing.assert_array_equal(
-        pixels(tmp_path / "full.png"), expected(tree.levels[1].splats, camera)
-    )  # fmt: skip
+    np.testing.assert_array_equal(pixels(tmp_path / "full.png"), expected(tree.levels[1].splats, camera))
     assert main([*command, str(tmp_path / "cut.png"), "--pixels", "4"]) == 0
     splats, _ = select(tree, camera.center, camera.focal, {"pixels": 4.0})
     assert 0 < len(splats) < 60

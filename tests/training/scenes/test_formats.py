@@ -341,7 +341,7 @@ def test_random_points_are_visible_in_two_views(tmp_path):
         (lambda d: d.update(k4=0.3), "its k4"),
         (lambda d: [f.update(file_path="../secret") for f in d["frames"]], "secret"),
     ],
-)  # fmt: skip
+)
 def test_invalid_files_are_reported_and_nothing_is_written(tmp_path, damage, message, capsys):
     write_transforms(tmp_path, damage)
     assert main(["scene", "--from", str(tmp_path)]) == 2

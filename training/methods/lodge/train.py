@@ -39,7 +39,7 @@ from .composite import (
     seen_from_distance,
     smooth,
     visible_rows,
-)  # fmt: skip
+)
 from .thresholds import MAX_CURVES, Thresholds
 
 COUNTED_VIEWS = 24

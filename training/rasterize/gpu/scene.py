@@ -193,7 +193,5 @@ def lens_of(view: KernelCamera, min_scale: float) -> np.ndarray:
     numbers[12:15] = view.position
     (left, right), (top, bottom) = view.x_limits, view.y_limits
     size = view.width, view.height
-    numbers[16:] = (
-        view.fx, view.fy, view.cx, view.cy, left, top, right, bottom, *size, view.near, min_scale
-    )  # fmt: skip
+    numbers[16:] = (view.fx, view.fy, view.cx, view.cy, left, top, right, bottom, *size, view.near, min_scale)
     return numbers

@@ -57,18 +57,12 @@ def format_results(reports: Sequence[dict]) -> str:
             f"N = {report['compared_splats']:,} splats, a quarter of the median finest level.",
             "",
         ]
-        columns = [
-            (head, [text(run) for run in report["runs"]])
-            for head, text in _COLUMNS
-        ]  # fmt: skip
+        columns = [(head, [text(run) for run in report["runs"]]) for head, text in _COLUMNS]
         columns = [(head, cells) for head, cells in columns if any(cell != "–" for cell in cells)]
         lines += _table(
             ["method", *(head for head, _ in columns)],
-            [
-                [run["label"], *(cells[row] for _, cells in columns)]
-                for row, run in enumerate(report["runs"])
-            ],
-        )  # fmt: skip
+            [[run["label"], *(cells[row] for _, cells in columns)] for row, run in enumerate(report["runs"])],
+        )
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
 

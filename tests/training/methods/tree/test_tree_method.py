@@ -185,7 +185,7 @@ def test_sizes_are_saturated_after_training(data, base, merge_by):
             assert float(sizes[node]) >= min_parent_size(np.array(float(sizes[child])), np.array(distance))
     np.testing.assert_array_equal(
         np.sort(levels[0].splats.extras["node_size"]), np.sort(sizes[nodes.leaves :])
-    )  # fmt: skip
+    )
 
 
 def test_step_updates_only_the_cut_of_its_view(data, base):
