@@ -92,10 +92,10 @@ def restart_levels(
     contribution = contributions(
         Gaussians(**tensors), wide, near=data.near, antialias=p.antialias, backend=backend
     )
-    importance, log_scales = contribution.largest.cpu().numpy(), tensors["log_scales"].cpu().numpy()
+    importance = contribution.largest.cpu().numpy()
     rank = np.empty(len(importance))
     rank[np.argsort(-importance, kind="stable")] = np.arange(1, len(importance) + 1)
-    first = {number: COUNT_RATIO ** (numbers[-1] - number) / rank for number in numbers}
+    scores = {number: COUNT_RATIO ** (numbers[-1] - number) / rank for number in numbers}
 
     values = {"gamma": gamma, "first": coarsest, "last": finest}
     views = {
@@ -106,19 +106,32 @@ def restart_levels(
     own_views = np.concatenate([views[number] for number in numbers])
     other_splats = sum(int(counts.sum()) for number, counts in views.items() if number not in numbers)
     max_views = max(drawn * finest_views.sum() - other_splats, MIN_SHARE * own_views.sum())
-    threshold = importance_threshold(np.concatenate(list(first.values())), own_views, max_views)
-    restarted = {}
-    for number in numbers:
-        keep = first[number] >= threshold
-        grown_scales = log_scales + log_scale_gain(log_scales, importance, keep)[:, None]
-        sizes = np.maximum(grown_scales, np.float32(np.log(s_min[number - 1])))
-        level = tensors | {"log_scales": torch.from_numpy(sizes).to(tensors["log_scales"])}
-        if p.antialias:
-            fraction = torch.from_numpy(np.exp(log_covered_area(grown_scales) - log_covered_area(sizes)))
-            level["opacity_logits"] = scale_opacities(tensors["opacity_logits"], fraction)
-        rows = torch.from_numpy(keep)
-        restarted[number] = {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
-    return restarted
+    threshold = importance_threshold(np.concatenate(list(scores.values())), own_views, max_views)
+    return {
+        number: _select_enlarged(
+            tensors, scores[number] >= threshold, importance, s_min[number - 1], p.antialias
+        )
+        for number in numbers
+    }
+
+
+def _select_enlarged(
+    tensors: Mapping[str, torch.Tensor],
+    mask: np.ndarray,
+    importance: np.ndarray,
+    s_min: float,
+    antialias: bool,
+) -> dict[str, torch.Tensor]:
+    """Return the splats of a mask (N,), enlarged to cover the area of all splats; see `restart_levels`."""
+    log_scales = tensors["log_scales"].cpu().numpy()
+    grown_scales = log_scales + log_scale_gain(log_scales, importance, mask)[:, None]
+    sizes = np.maximum(grown_scales, np.float32(np.log(s_min)))
+    level = {**tensors, "log_scales": torch.from_numpy(sizes).to(tensors["log_scales"])}
+    if antialias:
+        fraction = torch.from_numpy(np.exp(log_covered_area(grown_scales) - log_covered_area(sizes)))
+        level["opacity_logits"] = scale_opacities(tensors["opacity_logits"], fraction)
+    rows = torch.from_numpy(mask)
+    return {name: tensor[rows.to(tensor.device)] for name, tensor in level.items()}
 
 
 def log_covered_area(log_scales: np.ndarray) -> np.ndarray:
@@ -141,10 +154,8 @@ def random_values(rng: np.random.Generator, gamma: float, model: Model, single_s
     """
     numbers = list(_rows(model))
     frequencies = np.array([1.0] * (len(numbers) - 1) + [FINEST_WEIGHT])
-    factor, level = (
-        MAX_GAMMA_FACTOR ** rng.uniform(-1, 1),
-        int(rng.choice(numbers, p=frequencies / frequencies.sum())),
-    )
+    factor = MAX_GAMMA_FACTOR ** rng.uniform(-1, 1)
+    level = int(rng.choice(numbers, p=frequencies / frequencies.sum()))
     first, last = (level, level) if rng.uniform() < single_share else (numbers[0], numbers[-1])
     return {"gamma": gamma * factor, "first": first, "last": last}
 
