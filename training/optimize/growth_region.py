@@ -7,10 +7,11 @@ import torch
 from ..lod.crop import Crop
 from .model import PEAK_STATS, Model
 from .schedules import due
-from .support import INTERVAL
 
 OUTSIDE = "outside"
 """Column that marks rows outside the region with 1: no splats are added there."""
+UPDATE_INTERVAL = 50
+"""Steps between two updates of this column."""
 
 
 class GrowthRegion:
@@ -27,7 +28,7 @@ class GrowthRegion:
         """Clear the gradient statistics of splats outside, so that none are added there."""
         if self._region is None:
             return
-        if OUTSIDE not in model.columns or due(INTERVAL, step):
+        if OUTSIDE not in model.columns or due(UPDATE_INTERVAL, step):
             outside = ~self._region.contains(model["means"].detach().cpu().numpy())
             model.columns[OUTSIDE] = torch.from_numpy(outside).to(model["means"])
         for name in ("gradient_sum", PEAK_STATS[0]):

@@ -34,7 +34,7 @@ from .margins import MarginGenerator
 from .model import Model, select_rows
 from .parameters import Parameters
 from .schedules import ShSchedule, due
-from .support import INTERVAL, SupportPruning
+from .support import PRUNE_INTERVAL, SupportPruning
 from .training_data import TrainingData, TrainingView
 
 
@@ -331,7 +331,7 @@ class Method(ABC, Generic[P, D]):
         view = self.choose_view(step)
         result = self._step_without_autograd(view, step) or self._step_with_autograd(view, step)
         self.control_density(step)
-        if due(INTERVAL, step + 1) or self.ends_level(step):
+        if due(PRUNE_INTERVAL, step + 1) or self.ends_level(step):
             self.exposure.center()
             self.prune_unsupported(step)
         return result

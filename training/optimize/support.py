@@ -18,7 +18,7 @@ from .neighbors import query_neighbors
 
 NEIGHBORS = (1, 2, 4)
 """Ranks of the neighbours of a camera to form midpoints with."""
-INTERVAL = 50
+PRUNE_INTERVAL = 50
 """Steps between two removals of unsupported splats."""
 NEAREST_QUANTILE = 0.01
 """Quantile of point depths used as a view's nearest depth, which ignores outliers."""
