@@ -30,7 +30,7 @@ class LODGS_OT_reduce_detail(SceneOperator, bpy.types.Operator):
     """Select coarser levels by distance until a share of the finest level's splats is left out"""
 
     bl_idname = "lodgs.reduce_detail"
-    bl_label = "Save Splats"
+    bl_label = "Reduce Detail"
     bl_options = {"REGISTER", "UNDO"}
 
     share: bpy.props.FloatProperty(
