@@ -311,7 +311,7 @@ class RenderSettings(bpy.types.PropertyGroup):
     )
     before_meshes: bpy.props.StringProperty(
         name="Before Meshes",
-        description="Settings that Combine With Meshes changed and Remove restores, as JSON",
+        description="Settings that Combine with Meshes changed and Remove Meshes restores, as JSON",
         options={"HIDDEN"},
     )
 

@@ -330,7 +330,7 @@ class LODGS_OT_select_all_splats(EditLevelsOperator, bpy.types.Operator):
     """Deselect all splats of every level, or invert the selection"""
 
     bl_idname = "lodgs.select_all_splats"
-    bl_label = "Select All Splats"
+    bl_label = "Change Splat Selection"
     bl_options = {"REGISTER", "UNDO"}
 
     action: bpy.props.EnumProperty(

@@ -260,7 +260,7 @@ def _unpack_gzip(data: bytes, max_splats: int | None = None) -> tuple[_Header, l
     body = stream.decompress(stream.unconsumed_tail, sum(sizes) or 1)
     rest = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
     if len(body) != sum(sizes) or not stream.eof or (rest and not header.flags & _EXTENDED):
-        raise ValueError(f"its SPZ data are not those of {header.count:,} splats")
+        raise ValueError(f"its SPZ data do not match {header.count:,} splats")
     return header, np.split(np.frombuffer(body, np.uint8), np.cumsum(sizes)[:-1]), rest
 
 
