@@ -50,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
+    unused = {
+        "--preset": options.preset != "draft", "--ordered": options.ordered, "--lens": options.lens,
+        "--masks": options.masks,
+    }  # fmt: skip
+    if options.source and any(unused.values()):
+        word = next(word for word, value in unused.items() if value)
+        raise LodgsError(f"Cannot use {word}: it applies only to --photos.", f"Omit {word}.")
     return _reconstruct(options) if options.photos else _convert(options)
 
 

@@ -98,6 +98,15 @@ def test_masks_restart_the_reconstruction_and_exclude_features(photos, tmp_path)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "words", [("--masks", "folder"), ("--ordered",), ("--lens", "each"), ("--preset", "standard")]
+)
+def test_options_of_photos_are_refused_for_exports(tmp_path, capsys, words):
+    """They would have no effect."""
+    assert main(["scene", "--from", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 2
+    assert f"Cannot use {words[0]}: it applies only to --photos." in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("subfolder", [pytest.param("", marks=pytest.mark.nightly), "scene"])
 def test_scene_inside_its_photo_folder_resumes(photos, tmp_path, subfolder):
     folder = shutil.copytree(photos, tmp_path / "photos")
