@@ -133,7 +133,7 @@ def _resolve_rule(bundle: Bundle, controls: Values) -> tuple[Rule | None, Values
 
 def _measure_levels(job: Job, evaluation: Evaluation, bundle: Bundle) -> dict:
     """Return the report's head, the summary of the finest level, ``levels`` and ``aside``."""
-    offset_views = read_offset_views(Path(job.scene), bundle.origin)
+    offset_views = read_offset_views(Path(job.scene), bundle.origin) if job.scene else []
     offset_cameras = [camera.scaled(job.image_scale) for camera in offset_views]
     levels = standalone_levels(bundle)
     summary = summarize(evaluation, bundle)

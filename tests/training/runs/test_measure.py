@@ -29,6 +29,7 @@ from training.scenes.colmap import read_scene
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.ply import write_ply
 
 
 @pytest.fixture(scope="module")
@@ -237,6 +238,18 @@ def test_views_off_the_path_are_measured(finished, scene, splats, capsys):
     assert main(["evaluate", str(run)]) == 2
     assert "Traceback" not in capsys.readouterr().err
     shutil.rmtree(folder)
+
+
+def test_runs_on_captured_views_have_no_views_off_the_path(finished, scene, splats, tmp_path, monkeypatch):
+    """They have no scene; the current folder is not theirs."""
+    write_ply(tmp_path / "base.ply", splats)
+    keys = {"scene": "", "capture": "dome", "base": str(tmp_path / "base.ply"), "method": "lodge"}
+    run = finished(test_every=4, **keys)
+    shutil.copytree(scene, RunFolder(run).captured)
+    (tmp_path / "aside").mkdir()
+    (tmp_path / "aside" / "notes.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    assert "aside" not in evaluate_run(run)
 
 
 def test_missing_photos_are_reported_and_do_not_change_the_held_out_views(finished, scene, tmp_path):
