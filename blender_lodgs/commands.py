@@ -206,14 +206,14 @@ def _train(args: argparse.Namespace) -> int:
 def _import_for(job: Job) -> bpy.types.Object:
     """Import a job's photos, or its base splats if it trains on captured views, and return the scene root."""
     if not job.capture:
-        return _import_photos(Path(job.scene))
+        return _import_photos(Path(job.scene), *job.model_and_images)
     run = RunFolder(job.base)
     return importing.import_splats(bpy.context, run.bundle if run.bundle.exists() else run.path, warn=_warn)
 
 
-def _import_photos(folder: Path) -> bpy.types.Object:
+def _import_photos(folder: Path, model: Path | None = None, images: Path | None = None) -> bpy.types.Object:
     """Import a COLMAP scene, undistort its photos if needed and return the scene root."""
-    root = importing.import_colmap(bpy.context, folder, warn=_warn)
+    root = importing.import_colmap(bpy.context, folder, model=model, images=images, warn=_warn)
     photo_preparation.undistort_photos(root, _warn)
     return root
 

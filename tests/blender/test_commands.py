@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import COUNTS, splats
@@ -59,6 +60,23 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     assert second.read_bytes() == bundle.read_bytes()
     assert lodgs_command("info", bundle) == 0
     assert "20" in capfd.readouterr().out
+
+
+def test_train_imports_the_model_and_photos_of_the_job(bpy, lodgs, lodgs_command, fake, tmp_path):
+    """The trained levels belong to the cameras of this model, not of the largest one."""
+    fake()
+    scene, write = lodgs("training.scenes.colmap").read_scene(SCENE), lodgs("training.scenes.write_colmap")
+    points, seen = scene.points[:4], np.ones((5, 4), bool)
+    write.write_colmap(tmp_path / "few", scene.cameras[:5], points, seen, scene.point_colors[:4])
+    places = ("--model", tmp_path / "few" / "sparse" / "0", "--images", SCENE / "images")
+    train = ("train", "--scene", SCENE, *places, "--out", tmp_path / "run")
+    assert lodgs_command(*train, "--blend", tmp_path / "out.blend") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out.blend"))
+    (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
+    assert len([obj for obj in root.children_recursive if obj.type == "CAMERA"]) == 5
+    job = lodgs("training.runs.job").Job.from_file(tmp_path / "run" / "job.toml")
+    made = lodgs("runs.job_settings").make_job(root, tmp_path / "run", {})
+    assert (made.model, made.images) == (job.model, job.images)
 
 
 def test_train_from_a_base_sets_the_panels_settings(bpy, lodgs, lodgs_command, fake, tmp_path, monkeypatch):
