@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import LodgsError, printable
+from ..errors import LodgsError
 from ..files import check_folder, create_folder
 from ..settings import default_of, settings_of
 from .options import add_lpips, add_setting, lpips_archive, parse_factor, warn
@@ -77,14 +77,11 @@ def _scene_folders(options: argparse.Namespace) -> list[Path]:
     Raises:
         LodgsError: a scene does not exist, or two have the same name.
     """
+    from ..runs.several import check_different_names
+
     for scene in options.sources:
         check_folder(scene, "Name scenes, or runs.")
-    names = [scene.resolve().name for scene in options.sources]
-    for name in names:
-        if names.count(name) > 1:
-            raise LodgsError(
-                f"Cannot compare scenes: several folders are named {printable(name)}.", "Rename one of them."
-            )
+    check_different_names(options.sources)
     return options.sources
 
 

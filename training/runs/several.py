@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..errors import LodgsError, printable
 from ..evaluate.messages import format_duration
 from ..methods import method_info
 from ..scenes.check import SMALL_SIDE
@@ -32,6 +32,20 @@ class NamedJob(NamedTuple):
 
     name: str
     job: Job
+
+
+def check_different_names(scenes: Sequence[Path]) -> None:
+    """Check scenes whose runs are in folders with the scenes' names.
+
+    Raises:
+        LodgsError: two scenes have the same name.
+    """
+    names = [scene.resolve().name for scene in scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise LodgsError(
+                f"Cannot compare scenes: several folders are named {printable(name)}.", "Rename one of them."
+            )
 
 
 class ReducedJobs:

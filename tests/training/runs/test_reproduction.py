@@ -1,6 +1,7 @@
 """Tables of the papers: declarations, shortened trainings, trends, and the command."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -184,6 +185,13 @@ def test_memory_and_image_sizes_of_a_subject(tiny_scene, train, tmp_path):
     measured = subject.level_with_memory(5)
     assert sizes["psnr_1"] == measured["psnr"] == subject.level()["psnr"]
     assert sys.platform != "linux" or 0 <= measured["memory"] < 1
+
+
+def test_scenes_of_one_name_are_refused_before_training(tiny_scene, tmp_path):
+    """Their runs would have the same folders."""
+    scenes = [tiny_scene, Path(shutil.copytree(tiny_scene, tmp_path / tiny_scene.name))]
+    with pytest.raises(LodgsError, match="several folders are named"):
+        reproduce("clod", scenes, tmp_path, lambda job, text: pytest.fail(text), keys=KEYS)
 
 
 def test_failed_training_is_named(tiny_scene, tmp_path):

@@ -16,7 +16,7 @@ from ...files import atomic_write, create_folder
 from ...splats.dialects import Warn, ignore
 from ..folder import RunFolder
 from ..job import Job
-from ..several import NamedJob, ReducedJobs, Train, train_in_turn
+from ..several import NamedJob, ReducedJobs, Train, check_different_names, train_in_turn
 from .subject import Subject
 from .tables import Measured, Paper, Table, format_table
 
@@ -93,9 +93,10 @@ def reproduce(
         The contents of ``tables.md``.
 
     Raises:
-        LodgsError: there is no such table, or a training fails.
+        LodgsError: there is no such table, two scenes have the same name, or a training fails.
     """
     paper = load_paper(name)
+    check_different_names(scenes)
     chosen = chosen_tables(paper, tables)
     needed = _needed_trainings(paper, chosen)
     jobs = []
