@@ -20,6 +20,8 @@ MAX_PIXELS = 1 << 27
 """Maximum number of pixels of a rendered image or tile; a 16k frame has fewer."""
 MAX_COORDINATE = 1e12
 """Maximum absolute coordinate in any unit: float32 can hold the squares of such lengths."""
+_ROUNDING = 1e-6
+"""Pixels that a product of floats may lack to a whole number."""
 _FOCAL_RANGE = 1e-3, 1e6
 """Minimum and maximum focal length, as a multiple of the longer image side."""
 
@@ -154,7 +156,8 @@ class Camera:
 
     def scaled(self, share: float) -> Camera:
         """Return the view with image sides multiplied by ``share`` and rounded down to whole pixels."""
-        return self.resized(max(int(self.width * share), 1), max(int(self.height * share), 1))
+        width, height = (int(side * share + _ROUNDING) for side in (self.width, self.height))
+        return self.resized(max(width, 1), max(height, 1))
 
     def widened(self, share: float) -> Camera:
         """Return the camera with an image enlarged on each side by a fraction of its size."""

@@ -102,3 +102,14 @@ def test_lenses_fit_resized_and_turned_photos(name):
         stored = np.stack(columns, axis=1)
         turned_rays = rays @ view.turned(turns).world_to_camera[:3, :3].T
         np.testing.assert_allclose(project_with_colmap(lens.turned(turns), turned_rays), stored, atol=1e-9)
+
+
+def test_scaled_sides_do_not_lose_a_pixel_to_rounding():
+    """0.29 * 100 is 28.999999999999996, and 960 / 1100 * 1100 is 959.9999999999999."""
+    camera = Camera("view", 100, 75, 90.0, 90.0, 50.0, 37.5, np.eye(4))
+    assert [(view.width, view.height) for view in (camera.scaled(0.29), camera.scaled(0.5))] == [
+        (29, 21),
+        (50, 37),
+    ]
+    widths = range(64, 9000)
+    assert all(camera.resized(width, 64).scaled(960 / width).width == 960 for width in widths)
