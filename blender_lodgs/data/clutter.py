@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...training.errors import LodgsError
 from ...training.lod.rule import Masks
 from .. import extension
 from . import changes, cleaning, roots
@@ -21,6 +22,7 @@ from .cleanup_tests import (
     limit_property,
     suggest_clutter_limits,
 )
+from .placement import axes_of, world_matrix
 
 _matches: dict[int, dict[str, tuple[tuple, Masks]]] = {}
 """Key and masks of each test, by the ``session_uid`` of the scene root and the identifier of the test."""
@@ -28,7 +30,7 @@ _matches: dict[int, dict[str, tuple[tuple, Masks]]] = {}
 
 def _changed(settings: ClutterSettings, context: bpy.types.Context) -> None:
     if settings.preview:
-        refresh(context, settings.id_data)
+        _refresh_or_stop(context, settings.id_data)
 
 
 class ClutterSettings(bpy.types.PropertyGroup):
@@ -120,17 +122,25 @@ def refresh_later() -> None:
 def _refresh_all() -> None:
     for root in roots.roots(bpy.context.scene):
         if root.lodgs_clutter.preview and root.lodgs.existing_levels:
-            refresh(bpy.context, root)
+            _refresh_or_stop(bpy.context, root)
         elif root.session_uid in _matches:  # undo has ended the preview
             stop(root)
 
 
+def _refresh_or_stop(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Refresh the preview of a scene; end it if a level lost its splats or the scene was stretched."""
+    try:
+        refresh(context, root)
+    except LodgsError:  # Find Clutter states the reason
+        stop(root)
+
+
 def _key(root: bpy.types.Object, test: CleanupTest) -> tuple:
-    """Return a key that changes with the limits of a test, and the splats and scale of a scene."""
+    """Return a key that changes with the limits of a test, and the splats, scale and rotation of a scene."""
     clouds = [item.object.data for item in root.lodgs.existing_levels]
     limits = tuple(getattr(root.lodgs_clutter, limit_property(name)) for name in test.limits)
     return (
-        limits, cleaning.unit_length(root),
+        limits, cleaning.unit_length(root), tuple(world_matrix(axes_of(root)).to_quaternion()),
         *((cloud.session_uid, len(cloud.points), changes.version(cloud)) for cloud in clouds),
     )  # fmt: skip
 

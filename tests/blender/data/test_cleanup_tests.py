@@ -132,3 +132,19 @@ def test_large_background_matches_the_size_test_but_is_no_clutter(bpy, lodgs, ro
     assert clutter_counts(bpy, lodgs, root)["LARGE"] == OVERSIZED
     assert bpy.ops.lodgs.hide_splats(test="LARGE", size=1.0, action="SELECT") == {"FINISHED"}
     assert lodgs("data.cleaning").count_selected(root) == {1: OVERSIZED + DISTANT, 2: OVERSIZED}
+
+
+def test_preview_follows_the_rotation_and_ends_if_the_scene_is_stretched(bpy, lodgs, root):
+    clutter = lodgs("data.clutter")
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
+    root.lodgs_clutter.use_below = True
+    assert clutter.count_by_kind(root)["BELOW"] == 2 * BELOW
+    root.rotation_euler.x = np.pi  # the ground is above all other splats
+    bpy.context.view_layer.update()
+    assert clutter.count_by_kind(root) is None
+    clutter._refresh_all()
+    assert clutter.count_by_kind(root)["BELOW"] != 2 * BELOW
+    root.scale.x = 3
+    bpy.context.view_layer.update()
+    clutter._refresh_all()
+    assert not root.lodgs_clutter.preview
