@@ -58,7 +58,7 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     Raises:
         LodgsError: the scene has no splats, or it has compositor nodes of the user.
     """
-    if not roots.roots(scene):
+    if not roots.shows_splats(scene):
         raise LodgsError(
             f"Cannot combine with meshes: the scene '{scene.name}' has no splats.",
             "Import or train splats first.",
@@ -334,7 +334,7 @@ def add_shadow_catcher(root: bpy.types.Object, scene: bpy.types.Scene) -> bpy.ty
 
 
 def _shadows_changed(settings: RenderSettings, context: bpy.types.Context) -> None:
-    if settings.meshes is not None and roots.roots(settings.id_data):
+    if settings.meshes is not None and roots.shows_splats(settings.id_data):
         combine_with_meshes(settings.id_data)
 
 

@@ -169,7 +169,9 @@ def test_captures_hide_splats(bpy, lodgs, scene):
     assert [level.object.hide_render for level in root.lodgs.levels] == [True]
 
 
-def test_captures_hide_instances_of_linked_splats(bpy, lodgs, scene, tmp_path):
+@pytest.fixture
+def linked_instance(bpy, lodgs, scene, tmp_path):
+    """An instance of a linked collection of levels, in a file without a splat scene of its own."""
     [root] = lodgs("data.roots").roots(scene)
     name = lodgs("data.roots").levels_collection(root).name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
@@ -180,6 +182,19 @@ def test_captures_hide_instances_of_linked_splats(bpy, lodgs, scene, tmp_path):
     instance.instance_type, instance.instance_collection = "COLLECTION", linked.collections[0]
     bpy.context.scene.collection.objects.link(instance)
     bpy.context.view_layer.update()
+    return instance
+
+
+def test_captures_hide_instances_of_linked_splats(bpy, lodgs, linked_instance):
     lodgs("render.capture")._prepare(bpy.context.scene, 64, 48)
     bpy.context.view_layer.update()
-    assert [obj.hide_render for obj in linked.collections[0].objects] == [True]
+    assert [obj.hide_render for obj in linked_instance.instance_collection.objects] == [True]
+
+
+def test_instances_of_linked_splats_are_combined_with_meshes(bpy, linked_instance):
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    meshes = bpy.context.scene.lodgs_render.meshes
+    [level] = linked_instance.instance_collection.objects
+    meshes.view_layers[0].update()
+    assert level.evaluated_get(meshes.view_layers[0].depsgraph).hide_render
+    assert bpy.ops.lodgs.separate_meshes() == {"FINISHED"}
