@@ -472,7 +472,7 @@ def _curve_points(curve: bpy.types.Object | None) -> np.ndarray:
     Raises:
         LodgsError: there is no curve, or it does not have one spline.
     """
-    if curve is None:
+    if curve is None or not curve.users_collection:  # the setting keeps a deleted curve
         raise LodgsError("Cannot place views: no curve is chosen.", "Choose a curve, or choose other views.")
     if len(curve.data.splines) != 1:
         raise LodgsError(

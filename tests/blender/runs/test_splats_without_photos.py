@@ -162,6 +162,10 @@ def test_views_are_evenly_spaced_on_a_curve(bpy, fake, root, tmp_path):
     for view, _ in views:
         down = matrix[:3, :3] @ view.world_to_camera[1, :3]
         np.testing.assert_allclose(down / np.linalg.norm(down), [0, 0, -1], atol=1e-5)
+    with bpy.context.temp_override(selected_objects=[circle]):
+        bpy.ops.object.delete()
+    with pytest.raises(RuntimeError, match="no curve is chosen"):
+        bpy.ops.lodgs.train(folder=str(tmp_path / "run2"))
     bpy.data.objects.remove(circle)
     assert training.curve is None
 
