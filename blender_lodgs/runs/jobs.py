@@ -329,7 +329,7 @@ def _launch(
 
 
 def reattach() -> None:
-    """Attach to the runs of all scene roots that are not watched: after loading a file, undo and redo."""
+    """Attach to the runs of all scene roots that are not watched: after enabling, loading, undo and redo."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run and obj.is_editable]:
         if watch_of(root) is None and automatic_path(root.lodgs.training.run):
             with suppress(LodgsError):  # the panel reports a missing folder
@@ -360,6 +360,7 @@ def register() -> None:
     handlers.load_post.append(_on_load)
     handlers.undo_post.append(_on_undo)
     handlers.redo_post.append(_on_undo)
+    bpy.app.timers.register(reattach, first_interval=0)  # an update of the extension ends no training
 
 
 def unregister() -> None:
@@ -367,4 +368,6 @@ def unregister() -> None:
     handlers.load_post.remove(_on_load)
     handlers.undo_post.remove(_on_undo)
     handlers.redo_post.remove(_on_undo)
+    if bpy.app.timers.is_registered(reattach):
+        bpy.app.timers.unregister(reattach)
     watches.clear()

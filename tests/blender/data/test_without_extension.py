@@ -69,6 +69,7 @@ def test_enabling_the_extension_restores_the_open_file(bpy, lodgs, tmp_path):
         addon_utils.enable(EXTENSION)
     older_files = lodgs("data.older_files")
     assert bpy.app.timers.is_registered(older_files._upgrade_open_file)  # timers do not run in background
+    assert bpy.app.timers.is_registered(lodgs("runs.jobs").reattach)
     older_files._upgrade_open_file()
     root, level = bpy.data.objects["b"], bpy.data.objects["b level 2"]
     root.lodgs.mode = "SELECTIVE"
