@@ -36,6 +36,8 @@ def _lamp_irradiance(lamp: bpy.types.Light, matrix, position: Vector) -> np.ndar
     Units are those of Blender: the strength of a sun is an irradiance, that of other lamps a flux in watts.
     """
     color = np.array(lamp.color) * lamp.energy * 2 ** getattr(lamp, "exposure", 0.0)
+    if lamp.use_temperature:
+        color *= lamp.temperature_color
     if lamp.type == "SUN":
         return color
     offset = position - matrix.translation

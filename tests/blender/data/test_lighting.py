@@ -47,6 +47,13 @@ def test_lamps_give_their_irradiance(bpy, lodgs, scene, kind, energy, location, 
     np.testing.assert_allclose(light(bpy, lodgs), np.array([1, 0.5, 0.25]) * expected / 4, rtol=1e-5)
 
 
+def test_temperature_colours_a_lamp(bpy, lodgs, scene):
+    lamp = add_lamp(bpy, "SUN", (1, 1, 0.5), 4.0).data
+    lamp.use_temperature, lamp.temperature = True, 2700
+    red, green, blue = light(bpy, lodgs)
+    assert red > 2 * green > 4 * blue > 0  # the colour of an incandescent lamp
+
+
 def test_environment_image_counts_by_solid_angle(bpy, lodgs, scene):
     """The rows below a latitude of 30 degrees cover three quarters of the sphere."""
     image = bpy.data.images.new("sky", 64, 96, float_buffer=True)
