@@ -144,7 +144,7 @@ def test_exp2_accuracy():
 @numba.njit
 def alphas_of_rows(projected, left, alphas):
     """Fill alphas (N, 16, WIDTH) row by row, and return the smallest number on the way."""
-    shapes, reached = np.empty((7, WIDTH), np.float32), np.zeros((len(projected), REACHED), np.uint8)
+    shapes, reached = np.empty((7, WIDTH), np.float32), np.zeros((REACHED, len(projected)), np.uint8)
     splats = np.arange(len(projected), dtype=np.int32)
     find_rows(projected, splats, 0, len(splats), np.float32(0.5), np.float32(0.5), 16, shapes, reached)
     smallest = np.inf
@@ -153,7 +153,7 @@ def alphas_of_rows(projected, left, alphas):
         dx = ramp() + (left - row[0])
         constant, slope = row[LOG2_OPACITY] - row[CONIC_XX] * dx * dx, row[CONIC_XY] * dx
         for r in range(16):
-            if r % reached[i, GROUP] == 0:
+            if r % reached[GROUP, i] == 0:
                 dy = spread(np.float32(r) + np.float32(0.5) - row[1])
                 alpha, ratio = first_alphas(constant, slope, row[CONIC_YY], dy)
             store(alphas[i, r], 0, ratio)

@@ -27,6 +27,7 @@ from .lanes import (
     smaller,
     spread,
     store,
+    store_bytes,
     store_totals,
     total,
 )
@@ -82,10 +83,21 @@ CHECK_INTERVAL = 16
 
 
 @inlined(ORDERED)
-def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
-    """Fill reached (P, REACHED) with the rows that each pair reaches in each part of the tile.
+def store_integers(values, start, end, lanes, spare):
+    """Store the integer parts of lanes from ``start`` on, but none from ``end`` on."""
+    if start + WIDTH <= end:
+        store_bytes(values, start, lanes)
+    else:
+        store(spare, 0, lanes)
+        for j in range(end - start):
+            values[start + j] = int(spare[j])
 
-    A part has the first row and one past the last. The column GROUP is the number of rows for which
+
+@inlined(ORDERED)
+def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
+    """Fill reached (REACHED, P) with the rows that each pair reaches in each part of the tile.
+
+    A part has the first row and one past the last, which may be smaller. The row GROUP is the number of rows for which
     :func:`first_alphas` is valid. Lanes are pairs. This runs before blending, which would otherwise wait for
     the square roots. ``spare`` (7, WIDTH) is scratch memory.
     """
@@ -98,20 +110,14 @@ def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
         mean_x, mean_y, half_width = load(spare[0], 0), load(spare[1], 0), load(spare[2], 0)
         slope, rise, x_of_top = load(spare[3], 0), load(spare[4], 0), load(spare[5], 0)
         group = root(REACHABLE / larger(load(spare[6], 0), f32(0.01)))
-        store(spare[6], 0, larger(smaller(group, f32(TILE)), ONE))
-        for j in range(min(end - start, WIDTH)):
-            reached[start + j, GROUP] = int(spare[6, j])
+        store_integers(reached[GROUP], start, end, larger(smaller(group, f32(TILE)), ONE), spare[6])
         for part in range(PARTS):
             bounds = strip_bounds(
                 mean_x, mean_y, half_width, slope, rise, x_of_top,
                 left + f32(WIDTH * part), f32(WIDTH - 1), top, rows, MARGIN,
             )  # fmt: skip
-            store(spare[0], 0, bounds[0])
-            store(spare[1], 0, bounds[1])
-            for j in range(min(end - start, WIDTH)):
-                first = int(spare[0, j])
-                reached[start + j, 2 * part] = first
-                reached[start + j, 2 * part + 1] = max(first, int(spare[1, j]))
+            store_integers(reached[2 * part], start, end, bounds[0], spare[0])
+            store_integers(reached[2 * part + 1], start, end, bounds[1], spare[1])
 
 
 @inlined(FAST)
@@ -152,7 +158,7 @@ def blend_forward(
 ):  # fmt: skip
     """Fill image (3, H, W) and transmittance (H, W).
 
-    Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (P, REACHED) uint8;
+    Also fill ``visited`` with the number of pairs blended in each tile, and ``reached`` (REACHED, P) uint8;
     see :func:`find_rows`. A lane's T becomes negative when its pixel is finished, and is negative
     from the start outside the image. All later splats then fail the test against T_MIN, and |T| is preserved.
     The first splat deeper than the pixel's ``limit`` (H, W) finishes it too. If ``limit`` is None,
@@ -189,12 +195,12 @@ def blend_forward(
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
                 depth = row[DEPTH]
                 xx, xy, yy, log2_opacity = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY], row[LOG2_OPACITY]
-                falloff, group = row[FALLOFF], int(reached[pair, GROUP])
+                falloff, group = row[FALLOFF], int(reached[GROUP, pair])
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
                 for part in range(PARTS):
                     dx = ramp() + (offset_x + f32(WIDTH * part))
                     constant, slope = log2_opacity - xx * dx * dx, xy * dx
-                    first, last = int(reached[pair, 2 * part]), int(reached[pair, 2 * part + 1])
+                    first, last = int(reached[2 * part, pair]), int(reached[2 * part + 1, pair])
                     while first < last:
                         power, ratio = first_alphas(constant, slope, yy, spread(f32(first) + offset_y))
                         for r in range(first, min(first + group, last)):
@@ -382,13 +388,13 @@ def _make_backward(absolute: bool) -> Any:
                 xx, xy, yy = row[CONIC_XX], row[CONIC_XY], row[CONIC_YY]
                 red, green, blue = row[RED], row[GREEN], row[BLUE]
                 offset_x, offset_y = left - row[MEAN_X], top - row[MEAN_Y]
-                falloff, group = row[FALLOFF], int(reached[pair, GROUP])
+                falloff, group = row[FALLOFF], int(reached[GROUP, pair])
                 log2_opacity = row[LOG2_OPACITY]
                 all_g = all_dx = all_dxdx = all_dy = all_dxdy = all_dydy = spread(ZERO)
                 all_red = all_green = all_blue = all_x = all_y = spread(ZERO)
                 for part in range(PARTS):
-                    first, last = int(reached[pair, 2 * part]), int(reached[pair, 2 * part + 1])
-                    if first == last:
+                    first, last = int(reached[2 * part, pair]), int(reached[2 * part + 1, pair])
+                    if first >= last:
                         continue
                     dx = ramp() + (offset_x + f32(WIDTH * part))
                     constant, slope = log2_opacity - xx * dx * dx, xy * dx

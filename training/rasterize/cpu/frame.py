@@ -70,7 +70,7 @@ class HostFrame:
         self._pair_rows = self.pairs.first, self.pairs.count, self.pairs.row
         self.visited = np.empty(len(self.pairs.tile_start) - 1, np.int64)
         self.transmittance = buffers.take("transmittance", np.float32, view.height, view.width)
-        self._reached = buffers.take("reached", np.uint8, len(self.pairs.splat), REACHED)
+        self._reached = buffers.take("reached", np.uint8, REACHED, len(self.pairs.splat))
 
     def blend(
         self, rows: np.ndarray, background: np.ndarray, image: np.ndarray, limit: np.ndarray | None = None

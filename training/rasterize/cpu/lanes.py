@@ -61,6 +61,7 @@ class _Model(models.PrimitiveModel):
 LANES = VectorType("Lanes", FLOATS)
 MASK = VectorType("Mask", ir.VectorType(ir.IntType(1), WIDTH))
 NUMBER, INDEX, ARRAY = types.float32, types.intp, types.Array(types.float32, 1, "C")
+BYTES = types.Array(types.uint8, 1, "C")
 ROWS = types.Array(types.float32, 2, "C")
 """Array (K, WIDTH). ``rows[k] = value`` stores lanes, or copies a number to all lanes."""
 
@@ -228,6 +229,17 @@ def store(array, index, value):
 @_define(store, types.void, (ARRAY, INDEX, LANES))
 def _build_store(builder, array, index, value):
     builder.store(value, _address(builder, array, index), align=4)
+
+
+def store_bytes(array, index, value):
+    """Store the integer parts of lanes, 0 to 255, from ``index`` on. The index is not checked."""
+
+
+@_define(store_bytes, types.void, (BYTES, INDEX, LANES))
+def _build_store_bytes(builder, array, index, value):
+    integers = builder.fptoui(value, ir.VectorType(ir.IntType(8), WIDTH))
+    address = builder.gep(builder.extract_value(array, 4), [index], inbounds=True)
+    builder.store(integers, builder.bitcast(address, integers.type.as_pointer()), align=1)
 
 
 def load_row(rows, k) -> Any:
