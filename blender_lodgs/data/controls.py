@@ -7,7 +7,7 @@ import json
 import bpy
 
 from ...training.lod.rule import Control, find_rule
-from . import selection
+from . import metadata
 
 
 def changed_controls(root: bpy.types.Object) -> dict[str, float]:
@@ -30,12 +30,12 @@ def update_controls(root: bpy.types.Object, recorded: dict[str, float] | None = 
         LodgsError: a value is invalid.
     """
     settings, rule = root.lodgs, find_rule(root.lodgs.rule)
-    previous = selection.read_facts(settings.recorded_controls)
+    previous = metadata.read_facts(settings.recorded_controls)
     recorded = previous if recorded is None else recorded
     if rule is not None:
         numbers = [item.number for item in settings.existing_levels]
         defaults = {control.name: control.default for control in rule.controls}
-        old_values = defaults | previous | selection.read_facts(settings.initial_controls)
+        old_values = defaults | previous | metadata.read_facts(settings.initial_controls)
         new_values = (rule.defaults(numbers) if numbers else defaults) | recorded
         new_values = {control.name: control.validate(new_values[control.name]) for control in rule.controls}
         unset = [

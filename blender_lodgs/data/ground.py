@@ -14,9 +14,9 @@ from ...training.scenes.ground import (
     scaling_about,
 )
 from ..attributes import BASE, read_attribute
+from .metadata import read_json
 from .photographs import views
 from .placement import axes_of, move, placement_of
-from .selection import read_json
 
 MIN_DISTANCE = 1e-6
 """Minimum distance of two positions, as a fraction of their largest coordinate."""

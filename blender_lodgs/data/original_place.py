@@ -12,9 +12,9 @@ from mathutils import Matrix
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
 from ...training.splats.origin import NO_ORIGIN
+from .metadata import origin_of
 from .placement import axes_of, placement_of
 from .roots import roots
-from .selection import origin_of
 
 UNSCALED = 1e-5
 """Maximum difference of a scale from 1 that counts as rounding of Blender's float32 matrices."""

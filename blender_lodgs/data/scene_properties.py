@@ -8,8 +8,8 @@ import bpy
 
 from ...training.lod.rule import Control, Rule, resolve_rule, rules
 from ..nodes.camera_choices import CHOICES, find_choice
+from .metadata import read_json
 from .property_callbacks import look_up, tag_owner
-from .selection import read_json
 from .setting_properties import SUBTYPES
 from .training_settings import TrainingSettings
 

@@ -25,7 +25,7 @@ from ...training.splats.origin import describe_origin
 from .. import compat, extension
 from ..attributes import HIDDEN, write_attribute
 from ..nodes import display, ellipsoids
-from . import cleaning, crops, looks, objects, painting, selection, streams, tables
+from . import cleaning, crops, looks, metadata, objects, painting, selection, streams, tables
 from .controls import changed_controls, update_controls
 from .photographs import camera_of, is_held_out, views, views_with_photo
 from .placement import axes_of, lock_transform, placement_of, world_matrix
@@ -40,7 +40,7 @@ def check_facts(root: bpy.types.Object, bundle: Bundle) -> Rule | None:
             the scene's views.
     """
     rule = check_rule(bundle)
-    if views(root) and not np.array_equal(bundle.origin, selection.origin_of(root)):
+    if views(root) and not np.array_equal(bundle.origin, metadata.origin_of(root)):
         raise LodgsError(
             f"Cannot show levels in '{root.name}': their local origin is not that of the scene's cameras.",
             "Import the splats as a new scene.",
@@ -115,7 +115,7 @@ def contents(root: bpy.types.Object) -> str:
         (sum(len(obj.data.points) for obj in levels), "splat"),
     )
     text = ", ".join(f"{count:,} {noun}{'s' * (count != 1)}" for count, noun in counts if count)
-    origin = describe_origin(selection.origin_of(root))
+    origin = describe_origin(metadata.origin_of(root))
     return f"{text}. {origin}" if origin else text
 
 
@@ -161,7 +161,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
             scaled differently along its axes or the rule is unknown.
     """
     levels = [
-        Level(item.number, objects.read_splats(item.object), selection.read_facts(item.facts))
+        Level(item.number, objects.read_splats(item.object), metadata.read_facts(item.facts))
         for item in root.lodgs.existing_levels
     ]
     if not levels:
@@ -169,7 +169,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
             f"Cannot read the levels of '{root.name}': it has no levels.", "Train it or import splats first."
         )
     settings = root.lodgs
-    facts, meta = selection.read_facts(settings.facts), selection.read_json(settings.meta)
+    facts, meta = metadata.read_facts(settings.facts), metadata.read_json(settings.meta)
     bundle = Bundle(
         settings.method, levels, settings.rule, facts, changed_controls(root), settings.cumulative, meta,
         tables.read_tables(root) | view_tables(root),

@@ -8,7 +8,6 @@ converts the sockets of an evaluated modifier back to the rule's arguments.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -18,7 +17,6 @@ import numpy as np
 from ...training.errors import LodgsError
 from ...training.lod.query import LodQuery
 from ...training.lod.rule import Rule, collect_facts, fact_names, find_rule
-from ...training.splats.levels import Bundle
 from .. import compat
 from ..attributes import WEIGHT
 from ..nodes import crops as crop_groups
@@ -28,6 +26,7 @@ from ..nodes import rules as groups
 from ..nodes.building import add_modifier, read_scene, remove_modifier, replace_driver
 from ..nodes.camera_choices import CHOICES, find_choice, position_expression
 from . import crops, looks
+from .metadata import read_facts
 from .placement import axes_of
 from .tables import read_table
 
@@ -104,26 +103,6 @@ def _selects(group: bpy.types.NodeTree | None) -> bool:
 
 def _is_on(modifier: bpy.types.Modifier, depsgraph: bpy.types.Depsgraph) -> bool:
     return modifier.show_render if depsgraph.mode == "RENDER" else modifier.show_viewport
-
-
-def read_json(text: str) -> dict:
-    """Parse a property with a JSON object; {} if the text is invalid."""
-    try:
-        content = json.loads(text or "{}")
-        json.dumps(content, allow_nan=False)  # files allow no other numbers
-    except (ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def origin_of(root: bpy.types.Object) -> np.ndarray:
-    """Return the local origin of a splat scene, (3,) float64 (``training.splats.origin``)."""
-    return Bundle("", [], meta=read_json(root.lodgs.meta)).origin
-
-
-def read_facts(text: str) -> dict[str, float]:
-    """Return the numbers of :func:`read_json`, by name."""
-    return {name: value for name, value in read_json(text).items() if isinstance(value, int | float)}
 
 
 def camera_position(root: bpy.types.Object, scene: bpy.types.Scene) -> tuple[float, float, float]:

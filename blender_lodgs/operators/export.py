@@ -27,7 +27,7 @@ from ...training.splats.levels import Bundle, Level
 from ...training.splats.origin import describe_origin
 from ...training.splats.splat_format import SplatFormat
 from ...training.splats.streamed_levels import STREAMED_FILE
-from ..data import roots, scenes, selection
+from ..data import metadata, roots, scenes
 from ..data.objects import megabytes, sh_degree
 from ..data.paths import absolute_path
 from ..data.setting_properties import property_of
@@ -216,7 +216,7 @@ class _FormatExport(_ForeignExport, _FileExport, _ConvertingExport):
 
     def draw_original_place(self, context: bpy.types.Context) -> None:
         """Draw the option of scenes that have a local origin."""
-        if selection.origin_of(roots.active_root(context)).any():
+        if metadata.origin_of(roots.active_root(context)).any():
             row = self.layout.row()
             row.active = not self.placed
             row.prop(self, "original_place")
@@ -281,7 +281,7 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
         else:
             splats = scenes.visible_splats(context, root, self.placed, self.looked)
         path = self._path()
-        meta = selection.read_json(root.lodgs.meta)
+        meta = metadata.read_json(root.lodgs.meta)
         if self.placed:
             meta = {name: value for name, value in meta.items() if name not in ("origin", "georeference")}
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))

@@ -6,7 +6,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.scenes.cameras import write_camera
-from ..data import cameras, roots, selection
+from ..data import cameras, metadata, roots
 from ..data.paths import absolute_path
 from ..render import compositing, engine, mesh_depth, viewport_quality
 from .base import SceneOperator, report_errors, show_image
@@ -144,7 +144,7 @@ class LODGS_OT_export_camera(bpy.types.Operator, ExportHelper):
         root = roots.active_root(context)
         camera, near = cameras.view_from(root, context.evaluated_depsgraph_get(), width, height)
         path = absolute_path(self.filepath)
-        write_camera(path, camera.moved(selection.origin_of(root)), near)
+        write_camera(path, camera.moved(metadata.origin_of(root)), near)
         self.report({"INFO"}, f"Camera written to {path}")
         return {"FINISHED"}
 

@@ -8,7 +8,7 @@ import bpy
 
 from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule_error
-from ..data import detail, objects, roots, scenes, selection, streams
+from ..data import detail, metadata, objects, roots, scenes, streams
 from ..nodes.camera_choices import find_choice
 from ..viewport import views
 from .parts import LevelsPanel, say, sidebar_width, split_column
@@ -45,7 +45,7 @@ class LODGS_UL_levels(bpy.types.UIList):
         cloud = item.object.data
         facts = " ".join(
             f"{value:.2g}" if value else "all"  # 0: no splat is too small
-            for value in selection.read_facts(item.facts).values()
+            for value in metadata.read_facts(item.facts).values()
         )
         _columns(row, str(item.number), _short(len(cloud.points)), _short(objects.megabytes(cloud), 1), facts)
         solo = data.mode == "SINGLE" and data.single_level == item.number

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...training.evaluate.costs import cost_lines
-from ..data import roots, selection
+from ..data import metadata, roots
 from ..runs import run_folders
 from .parts import LevelsPanel, say, scene_length
 
@@ -32,7 +32,7 @@ class LODGS_PT_costs(LevelsPanel):
 
 def _lines(context: bpy.types.Context, root: bpy.types.Object) -> list[str]:
     """Return one line per level: its distance in Blender units and its rendering cost."""
-    meta = selection.read_json(root.lodgs.meta)
+    meta = metadata.read_json(root.lodgs.meta)
     return cost_lines(meta, lambda value: scene_length(context, root, value))
 
 

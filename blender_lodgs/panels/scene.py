@@ -6,7 +6,7 @@ import bpy
 
 from ...training.scenes.check import ERROR, INFO, WARNING
 from ...training.splats.origin import format_number
-from ..data import native, photographs, reloading, roots, selection
+from ..data import metadata, native, photographs, reloading, roots
 from ..runs import photo_preparation, scene_check
 from .parts import Panel, say, split_column
 
@@ -39,7 +39,7 @@ class LODGS_PT_scene(Panel):
             _draw_source(layout, column, root)
         if root.lodgs.levels:
             column.prop(root.lodgs, "antialias")
-        origin = selection.origin_of(root)
+        origin = metadata.origin_of(root)
         if origin.any():
             say(layout, f"Local origin {'  '.join(map(format_number, origin))}", "EMPTY_AXIS")
         row = layout.row(align=True)

@@ -12,7 +12,7 @@ from mathutils import Matrix, Vector
 from ...training.errors import LodgsError
 from ...training.scenes.ground import find_ground
 from .. import compat
-from ..data import cleaning, ground, roots, selection
+from ..data import cleaning, ground, metadata, roots
 from ..data.placement import placement_of
 from ..data.properties import RenderSettings
 from ..data.property_callbacks import ON_CHANGE
@@ -111,7 +111,7 @@ def separate_meshes(scene: bpy.types.Scene) -> None:
             f"Cannot separate: the scene '{scene.name}' has additional compositor nodes.",
             f"Remove the nodes that combine the images, then delete the scene '{meshes.name}'.",
         )
-    previous = selection.read_json(scene.lodgs_render.before_meshes)
+    previous = metadata.read_json(scene.lodgs_render.before_meshes)
     scene.render.film_transparent = bool(previous.get("film_transparent"))
     for layer in scene.view_layers:
         layer.use_pass_z = layer.name in previous.get("use_pass_z", ())

@@ -52,7 +52,7 @@ def test_scene_is_imported_near_0_and_keeps_its_origin(bpy, lodgs, far, capfd, t
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     root = lodgs("data.roots").active_root(bpy.context)
-    assert lodgs("data.selection").origin_of(root).tolist() == OFFSET.tolist()
+    assert lodgs("data.metadata").origin_of(root).tolist() == OFFSET.tolist()
 
 
 def test_exported_cameras_have_the_original_place(bpy, lodgs, far, tmp_path):
@@ -80,11 +80,11 @@ def test_levels_arrive_while_training(bpy, lodgs, far, fake, tmp_path):
     assert bpy.ops.lodgs.train(folder=str(tmp_path / "run")) == {"FINISHED"}
     assert [len(item.object.data.points) for item in root.lodgs.levels] == list(COUNTS.values())
     np.testing.assert_array_equal(positions(root.lodgs.levels[1].object), splats(COUNTS[2]).means)
-    assert lodgs("data.selection").origin_of(root).tolist() == ORIGIN
+    assert lodgs("data.metadata").origin_of(root).tolist() == ORIGIN
     fake()  # a trainer that ignores the origin
     with pytest.raises(RuntimeError, match="local origin"):
         bpy.ops.lodgs.train(folder=str(tmp_path / "other"))
-    assert lodgs("data.selection").origin_of(root).tolist() == ORIGIN
+    assert lodgs("data.metadata").origin_of(root).tolist() == ORIGIN
 
 
 def test_exports_name_the_origin_or_add_it(bpy, lodgs, tmp_path, capfd):

@@ -471,7 +471,7 @@ def test_capture_beside_a_georeferenced_scene_has_the_original_place(bpy, lodgs,
     bpy.context.scene.lodgs_capture.folder = str(tmp_path / "out")
     assert bpy.ops.lodgs.import_capture() == {"FINISHED"}
     imported = lodgs("data.roots").active_root(bpy.context)
-    assert lodgs("data.selection").origin_of(imported).any()
+    assert lodgs("data.metadata").origin_of(imported).any()
     bpy.context.view_layer.update()
     for view, position in zip(lodgs("data.photographs").views(imported), positions, strict=True):
         np.testing.assert_allclose(view.matrix_world.translation, position, atol=1e-4)
