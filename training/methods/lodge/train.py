@@ -207,9 +207,10 @@ class Method(RefiningMethod):
 
     def begin_round(self, step: int) -> None:
         """Prune the level before a step."""
-        p, number, local = self.parameters, self.level_at(step), self.stages.local_step(step)
-        importance, previous = self.importance(number), (0.0, *ROUNDS)[local // p.tune_steps]
-        keep, thinned = self._select_important(number, importance, previous, ROUNDS[local // p.tune_steps])
+        number, importance = self.level_at(step), self.importance(self.level_at(step))
+        pruning_round = self.stages.local_step(step) // self.parameters.tune_steps
+        previous, part = (0.0, *ROUNDS)[pruning_round], ROUNDS[pruning_round]
+        keep, thinned = self._select_important(number, importance, previous, part)
         with torch.no_grad():
             log_scales = self.model["log_scales"].cpu().numpy()
             gain = log_scale_gain(log_scales, importance.numpy(), keep.numpy())
@@ -257,13 +258,12 @@ class Method(RefiningMethod):
         share = 1 - (1 - self.parameters.drawn) * part
         if share == 1:
             return 0.0
-        level, near = self._smoothed_level(number), self.data.near
+        level, finest, near = self._smoothed_level(number), self.finished[self.levels], self.data.near
         levels = {**self.finished, number: level}
         views = np.zeros(len(level), np.int64)
         finest_splats = other_splats = 0
         for camera in pick_evenly(self.data.train, COUNTED_VIEWS):
-            single = self.finished[self.levels]
-            finest_splats += camera.sees(single.means[single.in_view(camera, near)], near).sum()
+            finest_splats += camera.sees(finest.means[finest.in_view(camera, near)], near).sum()
             for drawn, rows in visible_rows(levels, self.d_l, camera, near).items():
                 in_image = camera.sees(levels[drawn].means[rows], near)
                 if drawn == number:
