@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
@@ -54,6 +55,8 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         step=100_000,
     )
 
+    _imported: Sequence[str] = ()
+
     def invoke(self, context, event):
         if self.filepath or any(file.name for file in self.files):  # dropped
             return self.execute(context)
@@ -71,22 +74,25 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
 
         first = not roots.roots(context.scene)
         reader, stop = ThreadPoolExecutor(1, "lodgs-import"), Event()
-        self._imported = []
+        self._imported = imported = []
         try:
             for path in self.paths():
                 read = reader.submit(importing.splats_reader(absolute_path(str(path)), self.budget, stop))
                 while self._modal and not read.done():
                     yield
                 root = yield from importing.place_splats(context, read.result(), self.upright, warn)
+                imported.append(f"'{root.name}': {scenes.contents(root)}")
                 yield
                 if first:  # keep the view if the file already shows a splat scene
                     photographs.look_at_scene(context, root, warn)
                     first = False
                 photo_preparation.clear_result()
-                self._imported.append(f"'{root.name}': {scenes.contents(root)}")
         finally:
             stop.set()
             reader.shutdown(wait=False, cancel_futures=True)
+
+    def has_changed_data(self):
+        return bool(self._imported)
 
     def result_text(self, count):
         return "; ".join(self._imported)

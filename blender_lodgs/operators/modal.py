@@ -35,6 +35,10 @@ class SteppedOperator:
         """Return the status bar's text after ``count`` steps, while more follow."""
         raise NotImplementedError
 
+    def has_changed_data(self) -> bool:
+        """Return True if the steps so far changed Blender's data, which needs an undo step if they stop."""
+        return False
+
     def step_count(self, context: bpy.types.Context) -> int:
         """Return the number of steps, or 1 if it is unknown."""
         return 1
@@ -89,7 +93,7 @@ class SteppedOperator:
         context.workspace.status_text_set(None)
         if message:
             self.report({"INFO"}, message)
-        return result
+        return {"FINISHED"} if self.has_changed_data() else result
 
 
 class WaitingOperator(SteppedOperator):

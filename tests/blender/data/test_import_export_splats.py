@@ -2,6 +2,7 @@
 
 import json
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import plyfile
@@ -262,6 +263,25 @@ def test_undo_removes_an_import(bpy, file):
     assert len(bpy.data.pointclouds) == 3
     bpy.ops.ed.undo()
     assert not bpy.data.pointclouds and not bpy.data.objects and not bpy.data.node_groups
+
+
+def test_import_stopped_after_a_file_is_an_undo_step(bpy, lodgs, file):
+    """Otherwise the next undo would remove the imported file together with the change before."""
+    methods = vars(lodgs("operators.import_splats").LODGS_OT_import_splats)
+    names = ("work", "result_text", "status_text", "has_changed_data", "_imported")
+    bases = (lodgs("operators.modal").BackgroundOperator,)
+    operator = type("Operator", bases, {name: methods[name] for name in names})()
+    operator.paths, operator.report = (lambda: [file, file]), (lambda *_: None)
+    operator._modal, operator.upright, operator.budget = True, True, 0
+    names = ("scene", "view_layer", "collection", "screen", "mode")
+    context = MagicMock(**{name: getattr(bpy.context, name) for name in names})
+    operator.start_modal(context)
+    timer, escape = SimpleNamespace(type="TIMER"), SimpleNamespace(type="ESC")
+    assert operator.modal(context, escape) == {"CANCELLED"}, "nothing has changed"
+    operator.start_modal(context)
+    while not operator.has_changed_data():
+        assert operator.modal(context, timer) == {"RUNNING_MODAL"}
+    assert operator.modal(context, escape) == {"FINISHED"}
 
 
 def test_menus_list_import_and_export(bpy):
