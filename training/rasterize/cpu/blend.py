@@ -97,9 +97,9 @@ def store_integers(values, start, end, lanes, spare):
 def find_rows(projected, splat, begin, end, left, top, rows, spare, reached):
     """Fill reached (REACHED, P) with the rows that each pair reaches in each part of the tile.
 
-    A part has the first row and one past the last, which may be smaller. The row GROUP is the number of rows for which
-    :func:`first_alphas` is valid. Lanes are pairs. This runs before blending, which would otherwise wait for
-    the square roots. ``spare`` (7, WIDTH) is scratch memory.
+    A part has the first row and one past the last, which may be smaller. The entry GROUP is the number of
+    rows for which :func:`first_alphas` is valid. Lanes are pairs. This runs before blending, which would
+    otherwise wait for the square roots. ``spare`` (7, WIDTH) is scratch memory.
     """
     for start in range(begin, end, WIDTH):
         for j in range(WIDTH):
