@@ -110,6 +110,7 @@ def run(options: argparse.Namespace) -> int:
     from ..splats.formats import open_as_ply
 
     limits = setting_values(options, Cleaning)
+    _check_effects(options)
     if options.keep == "all" and (options.crop_box or options.crop_sphere) and _look(options) is None:
         raise LodgsError(
             "Cannot edit with --keep all: the crops have no effect without a look.",
@@ -134,6 +135,27 @@ def run(options: argparse.Namespace) -> int:
     with opened as source:
         _edit(options, source, outputs, limits)
     return 0
+
+
+def _check_effects(options: argparse.Namespace) -> None:
+    """Check that each option has something to affect.
+
+    Raises:
+        LodgsError: one has not.
+    """
+    files = [*options.plain, *options.levels]
+    others = [folder for folder in (options.streamed, options.tiles) if folder is not None]
+    chosen = setting_values(options, FileOptions)
+    crops = [*options.crop_box, *options.crop_sphere]
+    checks = [
+        ("--keep outside", options.keep == "outside", crops, "--crop-box or --crop-sphere"),
+        ("--antialiased", chosen.get("antialiased"), [*files, *others], "--plain, --levels or --streamed"),
+        ("--original-place", chosen.get("original_place"), files, "--plain or --levels"),
+        ("--lod-errors", chosen.get("lod_errors"), options.streamed, "--streamed"),
+    ]
+    for option, is_set, affected, remedy in checks:
+        if is_set and not affected:
+            raise LodgsError(f"Cannot edit with {option}: it has no effect.", f"Add {remedy}, or omit it.")
 
 
 def _outputs(options: argparse.Namespace) -> Outputs:
