@@ -139,7 +139,6 @@ _PAPER = replace(
     **PAPER | {"antialias": True, "densify_from": 600},
     densify_interval=300,
     prune_interval=300,
-    prune_oversized=True,
     densify_by="max",
     least_weight=0.02,
     levels_from="pruned",
