@@ -138,7 +138,9 @@ class RunFolder:
     @property
     def has_results(self) -> bool:
         """True if the folder has more than the records of trainings that failed at their start."""
-        records = {self.job, self.events_file, self.log, self.output, self.reserve, self._lock}
+        records = {
+            self.job, self.events_file, self.log, self.output, self.reserve, self.views, self._lock,
+        }  # fmt: skip
         paths = self.path.iterdir() if self.path.is_dir() else ()
         return any(path not in records and (not path.is_dir() or any(path.iterdir())) for path in paths)
 

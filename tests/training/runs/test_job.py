@@ -1,12 +1,13 @@
 """Jobs: files, presets, and errors."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
 from training.errors import LodgsError
-from training.runs.job import Job
+from training.runs.folder import RunFolder
+from training.runs.job import Job, save_job
 
 
 def write(path, text):
@@ -179,6 +180,22 @@ def test_unused_parameters_are_rejected():
     values = {"scene": "/s", "out": "/o", "method": "octree_neural", "parameters": {"dropout": 0.1}}
     with pytest.raises(LodgsError, match="'dropout'"):
         Job.from_dict(values)
+
+
+def test_settings_may_change_after_a_failed_start_only(tmp_path):
+    """A training that fails before its first step, such as for a missing device, has written its views."""
+    run = RunFolder(tmp_path)
+    run.create()
+    first = Job.from_dict({"scene": "/s", "out": str(run.path)}).resolved()
+    save_job(first, run)
+    run.views.write_text('{"a.jpg": [6, 4]}')
+    run.events_file.write_text("")
+    other = replace(first, image_scale=0.25)
+    save_job(other, run)
+    assert Job.from_file(run.job).image_scale == 0.25
+    run.level_file(1).write_bytes(b"splats")
+    with pytest.raises(LodgsError, match="different: image_scale"):
+        save_job(first, run)
 
 
 def test_preset_paper_trains_at_full_size():
