@@ -1,6 +1,7 @@
 """Other programs' exports, written from their documentation and compared with pycolmap's projections."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from training.__main__ import main
 from training.errors import LodgsError
 from training.scenes.colmap import read_scene
 from training.scenes.depths import DepthPriors, add_depth_points
-from training.scenes.formats import convert_export, find_exports
+from training.scenes.formats import convert_export, find_exports, transforms
 from training.scenes.point_cloud import read_points
 from training.scenes.triangulate import random_start_points
+from training.splats.georeference import Georeference
 
 from .depth_walls import write_png_map
 from .export_helpers import (
@@ -273,6 +275,18 @@ def test_place_on_earth_beside_an_export_is_kept(tmp_path, in_place):
     convert_export(source, None if in_place else out)
     place = read_scene(source if in_place else out).georeference
     assert place is not None and place.crs.startswith("PROJCS")
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_georeference_of_the_user_replaces_that_of_the_export(tmp_path, monkeypatch, in_place):
+    source, out = tmp_path / "source", tmp_path / "out"
+    write_transforms(source)
+    read, other = transforms.read, Georeference("EPSG:4978", np.eye(4))
+    monkeypatch.setattr(transforms, "read", lambda *paths: replace(read(*paths), georeference=other))
+    (source / "georeference.json").write_text('{"crs": "EPSG:32631"}')
+    convert_export(source, None if in_place else out)
+    place = read_scene(source if in_place else out).georeference
+    assert place is not None and place.crs == "EPSG:32631"
 
 
 def test_masks_are_linked(tmp_path):

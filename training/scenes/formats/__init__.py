@@ -15,6 +15,7 @@ from types import ModuleType
 
 from ...errors import LodgsError, SystemProblem, system_reason, system_remedy
 from ...files import check_folder, is_file, link_or_copy, temporary_folder
+from ...splats.georeference import FILE as GEOREFERENCE_FILE
 from ...splats.georeference import read_georeference, write_georeference
 from ..colmap import (
     DEPTHS,
@@ -180,8 +181,10 @@ def convert_export(
         warnings.append(
             f"{len(missing)} masks are missing, such as {missing[0]}. Their photos are not masked."
         )
-    if out is not None and exported.georeference is None:
-        exported = replace(exported, georeference=read_georeference(folder, warnings.append))
+    if exported.georeference is None or (folder / GEOREFERENCE_FILE).is_file():
+        own = read_georeference(folder, warnings.append)
+        if own is not None:  # the user's file stays as it is
+            exported = replace(exported, georeference=None if out is None else own)
     count = len(exported.points)
     if not count and all(view.has_depth for view in views):
         warnings.append(f"{name} has no points. Training creates them from the depth maps.")
