@@ -24,6 +24,7 @@ from training.runs.comparison.measures import (
 from training.runs.comparison.page import build_page, compare
 from training.runs.estimate import Estimate
 from training.runs.events import event_line
+from training.runs.finished import open_finished
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
@@ -183,6 +184,16 @@ def test_page_of_one_run_shows_all_of_its_levels(runs, report, tmp_path):
     (images,) = data["images"]
     assert list(images["variants"]) == ["Level 2", "Level 1", "By distance", "Level colours"]
     assert all(len(variant["images"]) == len(data["photos"]) for variant in images["variants"].values())
+
+
+def test_comparison_of_captured_views_is_named_after_the_captured_splats(runs, tmp_path, monkeypatch):
+    folder, job, data = open_finished(runs[1], print)
+    captured = replace(job, scene="", capture="dome", base="/files/statue.ply")
+    monkeypatch.setattr(
+        "training.runs.comparison.page.open_finished", lambda run, warn: (folder, captured, data)
+    )
+    assert compare(runs[1:], tmp_path)["scene"] == "statue.ply"
+    assert "statue.ply" in (tmp_path / "index.html").read_text()
 
 
 def test_runs_of_other_scenes_are_refused(runs, tmp_path):

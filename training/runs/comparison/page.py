@@ -66,7 +66,7 @@ def compare(
     cameras = compared_views(evaluation)
     images = _render(runs, measured, evaluation, cameras, notify)
     report = {
-        "scene": Path(job.scene).name,
+        "scene": Path(job.scene or job.base).name,
         "held_out": bool(data.test),
         "views": [camera.name for camera in cameras],
         "measured_views": len(evaluation.cameras),
