@@ -65,16 +65,20 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         )
     meshes = scene.lodgs_render.meshes
     tree = compat.compositor_tree(scene)
-    previous, is_new = _changed_settings(scene), meshes is None
-    if meshes is None:
+    previous, is_new = _changed_settings(scene), meshes is None or _is_shared(meshes)
+    if is_new:
         if not _is_ours(tree):
             raise LodgsError(
                 f"Cannot combine with meshes: the scene '{scene.name}' has compositor nodes.",
                 "Add nodes for both images and depths (manual: Rendering).",
             )
-        meshes = scene.lodgs_render.meshes = bpy.data.scenes.new(f"{scene.name} Meshes")
-        meshes.render.engine = mesh_engine
-        meshes.cycles.samples = SAMPLES
+        if meshes is None:
+            meshes = bpy.data.scenes.new("Meshes")
+            meshes.render.engine, meshes.cycles.samples = mesh_engine, SAMPLES
+        else:
+            meshes = meshes.copy()
+        meshes.name = f"{scene.name} Meshes"
+        scene.lodgs_render.meshes = meshes
         if not scene.lodgs_render.before_meshes:  # set if the user deleted the second scene
             scene.lodgs_render.before_meshes = json.dumps(previous)
     engine.use(scene)
@@ -117,7 +121,15 @@ def separate_meshes(scene: bpy.types.Scene) -> None:
         layer.use_pass_z = layer.name in previous.get("use_pass_z", ())
     compat.reset_compositor(scene)
     scene.lodgs_render.before_meshes = ""
-    bpy.data.scenes.remove(meshes)
+    if _is_shared(meshes):
+        scene.lodgs_render.meshes = None
+    else:
+        bpy.data.scenes.remove(meshes)
+
+
+def _is_shared(meshes: bpy.types.Scene) -> bool:
+    """Return whether several scenes have this scene of meshes, after a user has copied one of them."""
+    return sum(scene.lodgs_render.meshes == meshes for scene in bpy.data.scenes) > 1
 
 
 def _changed_settings(scene: bpy.types.Scene) -> dict:

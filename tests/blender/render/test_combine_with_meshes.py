@@ -84,6 +84,27 @@ def test_combining_works_again_after_deleting_the_mesh_scene(bpy, lodgs, scene):
     assert not scene.render.film_transparent and not scene.view_layers[0].use_pass_z
 
 
+@pytest.mark.parametrize("updated", [False, True])
+def test_copied_scene_leaves_the_meshes_of_its_original(bpy, lodgs, scene, updated):
+    assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+    meshes = scene.lodgs_render.meshes
+    meshes.cycles.samples = 7
+    bpy.ops.scene.new(type="LINK_COPY")
+    copy = bpy.context.scene
+    if updated:
+        assert bpy.ops.lodgs.combine_with_meshes() == {"FINISHED"}
+        assert copy.lodgs_render.meshes != meshes and copy.lodgs_render.meshes.cycles.samples == 7
+        nodes = lodgs("compat").compositor_tree(copy).nodes
+        assert {node.scene for node in nodes if node.bl_idname == "CompositorNodeRLayers"} == {
+            copy, copy.lodgs_render.meshes,
+        }  # fmt: skip
+    assert bpy.ops.lodgs.separate_meshes() == {"FINISHED"}
+    assert copy.lodgs_render.meshes is None and not copy.render.film_transparent
+    assert scene.lodgs_render.meshes == meshes and set(bpy.data.scenes) == {scene, copy, meshes}
+    nodes = lodgs("compat").compositor_tree(scene).nodes
+    assert {node.scene for node in nodes if node.bl_idname == "CompositorNodeRLayers"} == {scene, meshes}
+
+
 def test_mesh_scene_copies_markers_and_excluded_collections(bpy, lodgs, scene):
     cameras = [bpy.data.objects.new(name, bpy.data.cameras.new(name)) for name in "AB"]
     for name in ("hidden", "indirect"):
