@@ -120,6 +120,8 @@ class LODGS_PT_detail(LevelsPanel):
             camera = find_choice(settings.camera_choice)
             if camera.object:
                 column.prop(settings, camera.object)
+                if getattr(settings, camera.object) is None:  # distances are then measured from the origin
+                    layout.label(text="No object", icon="ERROR")
             elif camera.position and not camera.viewport:
                 column.prop(settings, camera.position, text="Position")
             if context.scene.camera is None and not camera.viewport:

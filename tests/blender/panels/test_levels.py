@@ -97,6 +97,14 @@ def town(bpy, lodgs):
     return root
 
 
+def test_missing_object_for_distances_is_reported(bpy, root, draw):
+    scene_root = root("bands")
+    scene_root.lodgs.mode, scene_root.lodgs.camera_choice = "SELECTIVE", "OBJECT"
+    assert "No object" in draw().texts
+    scene_root.lodgs.camera_object = bpy.data.objects.new("actor", None)
+    assert "No object" not in draw().texts
+
+
 def test_chunk_of_the_camera_and_loaded_splats_are_shown(bpy, lodgs, town, draw):
     def draw_at(camera, **controls):
         town.lodgs.camera_center = camera
