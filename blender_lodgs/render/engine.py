@@ -401,10 +401,13 @@ def _motion_of(
 def _is_selected_by_rule(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
     """Return True if an instance shows the splats of its object, selected by a rule alone.
 
-    Objects that are hidden in the viewport do not count, because Blender does not report their changes.
+    Objects that are hidden in the viewport and objects of scenes that no window shows do not count, because
+    Blender does not report their changes.
     """
+    shown_scenes = {bpy.context.scene, *(window.scene for window in bpy.context.window_manager.windows)}
     return display.is_reduced(instance.evaluated.data) or (
-        selection.only_lodgs_modifiers(instance.evaluated, depsgraph)
+        depsgraph.scene.original in shown_scenes
+        and selection.only_lodgs_modifiers(instance.evaluated, depsgraph)
         and attributes.WEIGHT not in instance.object.data.attributes
         and instance.object.visible_get(view_layer=depsgraph.view_layer)
     )

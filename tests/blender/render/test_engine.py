@@ -425,6 +425,19 @@ def test_splats_hidden_in_viewports_are_read_at_every_frame(bpy, lodgs, scene, t
     assert np.abs(render_file(bpy, tmp_path) - before).mean() > 0.01 and len(sent_sets) == 2
 
 
+def test_splats_of_a_scene_in_no_window_are_read_at_every_frame(bpy, lodgs, scene, sent_sets):
+    [root] = lodgs("data.roots").roots(scene)
+    cloud, attributes = root.lodgs.levels[1].object.data, lodgs("attributes")
+    bpy.context.window.scene = bpy.data.scenes.new("other")
+    for brightness in (1, 0):
+        base = attributes.read_attribute(cloud, "radiance:base")
+        base[:, :3] *= brightness
+        attributes.write_attribute(cloud, "radiance:base", cloud.attributes["radiance:base"].data_type, base)
+        cloud.update_tag()
+        assert bpy.ops.render.render(scene=scene.name) == {"FINISHED"}
+    assert len(sent_sets) == 2
+
+
 def test_undo_does_not_send_unchanged_splats_again(bpy, lodgs, scene, sent_sets):
     before = render_passes(bpy, lodgs)["Combined.R"]
     count = len(sent_sets)
