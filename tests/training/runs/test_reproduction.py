@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.training.lod.tree.trees import tree_of
 from training.__main__ import main
 from training.cli import reproduce as command
 from training.errors import LodgsError
@@ -185,6 +186,18 @@ def test_memory_and_image_sizes_of_a_subject(tiny_scene, train, tmp_path):
     measured = subject.level_with_memory(5)
     assert sizes["psnr_1"] == measured["psnr"] == subject.level()["psnr"]
     assert sys.platform != "linux" or 0 <= measured["memory"] < 1
+
+
+def test_cache_of_a_streamed_tree(tiny_scene, train, splats, tmp_path):
+    """The second view needs the nodes of the first one."""
+    (job,) = make_jobs(load_paper("flod"), ["FLoD"], ReducedJobs(tiny_scene, "paper", 0.1, KEYS), tmp_path)
+    train(job, "")
+    write_bundle(RunFolder(job.out).bundle, tree_of(splats))
+    subject = Subject(Path(job.out))
+    cached, uncached = subject.streamed(reuse=True), subject.streamed(reuse=False)
+    nodes = sum(len(level.rows) for level in subject.bundle.levels)
+    assert 0 <= cached["loaded"] < uncached["loaded"] <= nodes
+    assert cached["ms"] < uncached["ms"]
 
 
 def test_scenes_of_one_name_are_refused_before_training(tiny_scene, tmp_path):

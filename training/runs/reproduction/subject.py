@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from ...editing.export import Compression
 from ...evaluate.frame_memory import measure_frame_memory
 from ...evaluate.views import REDUCTIONS, full_detail_source
+from ...lod.blocks import SIZE
 from ...lod.selection import resolve_controls, select
+from ...lod.tree.nodes import detail_of
+from ...lod.tree.paging import TreeFile
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
@@ -62,6 +68,29 @@ class Subject:
             return self._named(self.evaluation.measure_by_distance(self._resident, values))
 
         return self._once(("by_distance", *sorted(values.items())), measure)
+
+    def streamed(self, reuse: bool) -> dict[str, float]:
+        """Measure frames of the training views in their order, whose nodes are read from a tree's file.
+
+        Args:
+            reuse: keep nodes in memory from view to view; otherwise each view loads all that it needs.
+
+        Returns:
+            Means over the views but the first: ``loaded`` nodes, and ``ms`` to load and draw them.
+        """
+        values = resolve_controls(self.bundle, {})
+        file, pager = TreeFile(self.folder.bundle), None
+        loaded, seconds = [], []
+        for camera in self.evaluation.data.train:
+            pager = pager if pager and reuse else file.pager(file.total + SIZE)
+            detail = detail_of(camera.focal, values["pixels"])
+            begin, count = time.perf_counter(), 0
+            while update := pager.step(camera.center, detail, camera.world_to_camera[2, :3]):
+                count += sum(len(splats) for _, splats in update.pages)
+            seconds.append(time.perf_counter() - begin)
+            loaded.append(count)
+        drawing = self.by_distance()["ms"]
+        return {"loaded": float(np.mean(loaded[1:])), "ms": 1e3 * float(np.mean(seconds[1:])) + drawing}
 
     def predetermined(self, **controls: float) -> dict[str, float]:
         """Measure the levels that the mean training camera selects, for all views (FLoD, Sec. 5.2)."""
