@@ -75,15 +75,6 @@ def main() -> int:
 
 def write_report(scene: Path, run: RunFolder, out: Path) -> int:
     """Measure a finished run, and write its report and pages; return an exit code."""
-    title = scene.resolve().name.replace("_", " ").capitalize()
-    folders = [run.path.resolve(), "--out", out.resolve() / "page"]
-    command = [sys.executable, "-m", "training", "page", *folders, "--title", title]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as page:  # while this measures
-        return _write_comparison(scene, run, out) or page.wait()
-
-
-def _write_comparison(scene: Path, run: RunFolder, out: Path) -> int:
-    """Measure a finished run, and write its report and the page of its levels; return an exit code."""
     if code := lodgs(["evaluate", str(run.path), "--far"]):  # compare needs these measures, too
         return code
     measured = json.loads(run.metrics.read_text())
@@ -95,8 +86,11 @@ def _write_comparison(scene: Path, run: RunFolder, out: Path) -> int:
         report["curve"] = [_splat_count_row(row) for row in measured["curve"]]
     (out / "report.json").write_text(json.dumps(report, indent=1))
     shutil.copy2(run.sheet, out / "levels.png")
+    title = scene.resolve().name.replace("_", " ").capitalize()
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-        return lodgs(["compare", str(run.path), "--out", str(out)])
+        return lodgs(["compare", str(run.path), "--out", str(out)]) or lodgs(
+            ["page", str(run.path), "--out", str(out / "page"), "--title", title]
+        )
 
 
 def _splat_count_row(row: dict) -> dict:
