@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import torch
+
 from ..errors import LodgsError
 from ..evaluate.lpips import load_lpips
 from ..evaluate.metrics import ssim
@@ -66,7 +68,10 @@ def open_evaluation(
     """
     folder, job, data = open_finished(run, warn)
     bundle = read_or_open_bundle(folder.bundle)
-    measures = {"ssim": ssim, **load_lpips(lpips, tensor_device(job.backend))}
+    networks = load_lpips(lpips, tensor_device(job.backend))
+    if not networks:  # torch's threads would compete with the kernels' threads; only LPIPS gains from them
+        torch.set_num_threads(1)
+    measures = {"ssim": ssim, **networks}
     return folder, job, bundle, Evaluation(data, job.backend, bundle.antialias, measures)
 
 
