@@ -205,8 +205,7 @@ class TrainingData:
 
     def view(self, index: int, shrink: float = 1) -> TrainingView:
         """Return a training view by index, reduced by ``shrink``."""
-        camera = self.camera(index, shrink)
-        return TrainingView(index, camera, self.images.target(camera), shrink)
+        return TrainingView(index, self.camera(index, shrink), self.target(index, shrink), shrink)
 
     def camera(self, view: int, shrink: float = 1) -> Camera:
         """Return the camera of a training view, with an image reduced by ``shrink``."""
