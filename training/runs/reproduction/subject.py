@@ -15,9 +15,9 @@ from ...editing.export import Compression
 from ...evaluate.frame_memory import measure_frame_memory
 from ...evaluate.views import REDUCTIONS, full_detail_source
 from ...lod.blocks import SIZE
+from ...lod.on_disk import open_paged
+from ...lod.query import LodQuery
 from ...lod.selection import resolve_controls, select
-from ...lod.tree.nodes import detail_of
-from ...lod.tree.paging import TreeFile
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera
 from ...splats.bundle import read_bundle
@@ -78,17 +78,26 @@ class Subject:
         Returns:
             Means over the views but the first: ``loaded`` nodes, and ``ms`` to load and draw them.
         """
-        values = resolve_controls(self.bundle, {})
-        file, pager = TreeFile(self.folder.bundle), None
+        rule, values = self.bundle.rule, tuple(resolve_controls(self.bundle, {}).items())
+        facts = tuple(self.bundle.facts.items())
+        file, pager = open_paged(self.folder.bundle), None
         loaded, seconds = [], []
         for camera in self.evaluation.data.train:
-            pager = pager if pager and reuse else file.pager(file.total + SIZE)
-            detail = detail_of(camera.focal, values["pixels"])
             begin, count = time.perf_counter(), 0
-            while update := pager.step(camera.center, detail, camera.world_to_camera[2, :3]):
-                count += sum(len(splats) for _, splats in update.pages)
+            if pager is None or not reuse:
+                pager = file.pager(file.total + SIZE)
+                pager.start()
+            pager.ask(LodQuery(rule, tuple(camera.center), camera.focal, facts, values))
+            while not pager.idle:
+                if update := pager.take():
+                    count += sum(len(splats) for _, splats in update.pages)
+                else:
+                    time.sleep(1e-4)
             seconds.append(time.perf_counter() - begin)
             loaded.append(count)
+            if not reuse:
+                pager.stop()
+        pager.stop()
         drawing = self.by_distance()["ms"]
         return {"loaded": float(np.mean(loaded[1:])), "ms": 1e3 * float(np.mean(seconds[1:])) + drawing}
 
