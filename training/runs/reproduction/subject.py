@@ -80,11 +80,14 @@ class Subject:
         """
         rule, values = self.bundle.rule, tuple(resolve_controls(self.bundle, {}).items())
         facts = tuple(self.bundle.facts.items())
-        file, pager = open_paged(self.folder.bundle), None
+        file = open_paged(self.folder.bundle)
+        pager = file.pager(file.total + SIZE)
+        pager.start()
         loaded, seconds = [], []
         for camera in self.evaluation.data.train:
             begin, count = time.perf_counter(), 0
-            if pager is None or not reuse:
+            if not reuse:
+                pager.stop()
                 pager = file.pager(file.total + SIZE)
                 pager.start()
             pager.ask(LodQuery(rule, tuple(camera.center), camera.focal, facts, values))
@@ -95,8 +98,6 @@ class Subject:
                     time.sleep(1e-4)
             seconds.append(time.perf_counter() - begin)
             loaded.append(count)
-            if not reuse:
-                pager.stop()
         pager.stop()
         drawing = self.by_distance()["ms"]
         return {"loaded": float(np.mean(loaded[1:])), "ms": 1e3 * float(np.mean(seconds[1:])) + drawing}
