@@ -12,7 +12,8 @@ PAGES = [
     *(page for name in ("start", "manual", "methods", "command-line") for page in (DOCS / name).glob("*.md")),
     *(DOCS / "reference" / f"{name}.md" for name in ("controls", "formats", "level-formats", "api")),
 ]
-PAGES.remove(DOCS / "command-line" / "commands.md")  # generated
+for generated in ("command-line/commands.md", "methods/results-scenes.md"):
+    PAGES.remove(DOCS / generated)
 MAX_WORDS = 900
 
 
