@@ -194,10 +194,11 @@ def test_cache_of_a_streamed_tree(tiny_scene, train, splats, tmp_path):
     train(job, "")
     write_bundle(RunFolder(job.out).bundle, tree_of(splats))
     subject = Subject(Path(job.out))
-    cached, uncached = subject.streamed(reuse=True), subject.streamed(reuse=False)
+    cached, uncached, small = subject.streamed(), subject.streamed(reuse=False), subject.streamed(0.1)
     nodes = sum(len(level.rows) for level in subject.bundle.levels)
     assert 0 <= cached["loaded"] < uncached["loaded"] <= nodes
-    assert cached["ms"] < uncached["ms"]
+    assert cached["ms"] < uncached["ms"] and small["loaded"] <= nodes
+    assert cached["fps"] == pytest.approx(1e3 / cached["ms"])
 
 
 def test_scenes_of_one_name_are_refused_before_training(tiny_scene, tmp_path):

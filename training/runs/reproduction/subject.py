@@ -69,26 +69,29 @@ class Subject:
 
         return self._once(("by_distance", *sorted(values.items())), measure)
 
-    def streamed(self, reuse: bool) -> dict[str, float]:
+    def streamed(self, share: float = 1.0, reuse: bool = True) -> dict[str, float]:
         """Measure frames of the training views in their order, whose nodes are read from a tree's file.
 
         Args:
+            share: maximum number of nodes in memory, as a share of all. If a view needs more, it is coarser.
             reuse: keep nodes in memory from view to view; otherwise each view loads all that it needs.
 
         Returns:
-            Means over the views but the first: ``loaded`` nodes, and ``ms`` to load and draw them.
+            Means over the views but the first: ``loaded`` nodes, ``ms`` to load them and draw the complete
+            cut, and ``fps``.
         """
         rule, values = self.bundle.rule, tuple(resolve_controls(self.bundle, {}).items())
         facts = tuple(self.bundle.facts.items())
         file = open_paged(self.folder.bundle)
-        pager = file.pager(file.total + SIZE)
+        budget = int(share * file.total) + SIZE
+        pager = file.pager(budget)
         pager.start()
         loaded, seconds = [], []
         for camera in self.evaluation.data.train:
             begin, count = time.perf_counter(), 0
             if not reuse:
                 pager.stop()
-                pager = file.pager(file.total + SIZE)
+                pager = file.pager(budget)
                 pager.start()
             pager.ask(LodQuery(rule, tuple(camera.center), camera.focal, facts, values))
             while not pager.idle:
@@ -99,8 +102,8 @@ class Subject:
             seconds.append(time.perf_counter() - begin)
             loaded.append(count)
         pager.stop()
-        drawing = self.by_distance()["ms"]
-        return {"loaded": float(np.mean(loaded[1:])), "ms": 1e3 * float(np.mean(seconds[1:])) + drawing}
+        frame_ms = 1e3 * float(np.mean(seconds[1:])) + self.by_distance()["ms"]
+        return {"loaded": float(np.mean(loaded[1:])), "ms": frame_ms, "fps": 1e3 / frame_ms}
 
     def predetermined(self, **controls: float) -> dict[str, float]:
         """Measure the levels that the mean training camera selects, for all views (FLoD, Sec. 5.2)."""
