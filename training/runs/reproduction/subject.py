@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...editing.export import Compression
+from ...errors import LodgsError
 from ...evaluate.frame_memory import measure_frame_memory
 from ...evaluate.views import REDUCTIONS, full_detail_source
 from ...lod.blocks import SIZE
@@ -79,6 +80,9 @@ class Subject:
         Returns:
             Means over the views but the first: ``loaded`` nodes, ``ms`` to load them and draw the complete
             cut, and ``fps``.
+
+        Raises:
+            LodgsError: the rule allows no streaming, or the file cannot be read.
         """
         rule, values = self.bundle.rule, tuple(resolve_controls(self.bundle, {}).items())
         facts = tuple(self.bundle.facts.items())
@@ -102,6 +106,8 @@ class Subject:
             seconds.append(time.perf_counter() - begin)
             loaded.append(count)
         pager.stop()
+        if pager.problem:
+            raise LodgsError(f"Cannot measure {self.run}: {pager.problem}", "Restore its bundle.")
         frame_ms = 1e3 * float(np.mean(seconds[1:])) + self.by_distance()["ms"]
         return {"loaded": float(np.mean(loaded[1:])), "ms": frame_ms, "fps": 1e3 / frame_ms}
 
