@@ -8,11 +8,14 @@ plus the loss of colour.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit, spence
 
+from ..rasterize.cpu.compile import STRICT, inlined, kernel, run_parallel
 from ..splats.batches import batch_slices
 from ..splats.gaussians import SH_C0, Splats, splat_area
 from ..splats.morton import spatial_order
@@ -30,6 +33,8 @@ MIN_PAIRED_SHARE = 1 / 64
 """Minimum fraction of splats that must pair up in a round; otherwise neighbours on a curve merge."""
 _BATCH_ROWS = 1 << 15
 """Number of splats to process at a time, few enough for the processor's cache."""
+_GRAIN = 1 << 10
+"""Rows of a thread's unit of work."""
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 """Indices of the six entries of a covariance: xx, xy, xz, yy, yz, zz."""
 
@@ -126,17 +131,8 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
     count = len(moments)
     _, neighbors = query_neighbors(KDTree(moments[:, :3]), moments[:, :3], min(NEIGHBORS + 1, count))
     partners, costs = np.empty(count, np.int64), np.empty(count)
-    columns = np.ascontiguousarray(moments.T)
-    log_areas = _log_areas(columns[3:9])
-    for part in batch_slices(count, _BATCH_ROWS // NEIGHBORS):
-        rows = np.arange(count)[part]
-        candidates = neighbors[part]
-        first, second = np.minimum(rows[:, None], candidates), np.maximum(rows[:, None], candidates)
-        pair_costs = _errors(columns, log_areas, first, second)
-        pair_costs[candidates == rows[:, None]] = np.inf
-        best = pair_costs.argmin(axis=1)[:, None]
-        partners[part] = np.take_along_axis(candidates, best, 1)[:, 0]
-        costs[part] = np.take_along_axis(pair_costs, best, 1)[:, 0]
+    moments = np.ascontiguousarray(moments)
+    run_parallel(_choose_partners, count, _GRAIN, moments, _log_areas(moments), neighbors, partners, costs)
     # a pair merges if no cheaper one has a splat in common with it
     rank = np.empty(count, np.int64)
     rank[np.argsort(costs, kind="stable")] = np.arange(count)
@@ -152,33 +148,69 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
 
 def merge_errors(moments: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the errors of merging rows ``first`` with rows ``second``: areas, times an optical depth."""
-    columns = np.ascontiguousarray(moments.T)
-    return _errors(columns, _log_areas(columns[3:9]), first, second)
+    moments, errors = np.ascontiguousarray(moments), np.empty(len(first))
+    run_parallel(_fill_errors, len(first), _GRAIN, moments, _log_areas(moments), first, second, errors)
+    return errors
 
 
-def _errors(moments: np.ndarray, log_areas: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the errors of merging columns ``first`` of moments (C, N) with columns ``second``.
+def _log_areas(moments: np.ndarray) -> np.ndarray:
+    """Return half the log of the second invariant of covariances, (N,); log(s1 s2) for a flat splat."""
+    areas = np.empty(len(moments))
+    run_parallel(_fill_log_areas, len(moments), _GRAIN, moments, areas)
+    return areas
 
-    Args:
-        log_areas: :func:`_log_areas` of all columns.
-    """
-    a, b = moments[:, first], moments[:, second]
+
+@inlined(STRICT)
+def _log_area(xx, xy, xz, yy, yz, zz):
+    return math.log(max(xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz, 1e-120)) / 2
+
+
+@kernel(STRICT)
+def _fill_log_areas(begin, end, moments, areas):
+    for i in range(begin, end):
+        row = moments[i]
+        areas[i] = _log_area(row[3], row[4], row[5], row[6], row[7], row[8])
+
+
+@inlined(STRICT)
+def _pair_error(moments, log_areas, first, second):
+    """Return the error of merging two rows. It depends on their order in the last bits."""
+    a, b = moments[first], moments[second]
     mass = a[9] + b[9]
-    share = a[9] / mass
-    covariances = share * a[3:9] + (1 - share) * b[3:9]
-    offset = a[:3] - b[:3]
-    spread = share * (1 - share)
-    for covariance, row, column in zip(covariances, _ROWS, _COLUMNS, strict=True):
-        covariance += spread * (offset[row] * offset[column])
-    loss = _log_areas(covariances) - share * log_areas[first] - (1 - share) * log_areas[second]
-    colors = ((a[10:] - b[10:]) ** 2).sum(0)
-    return mass * (loss + COLOR_WEIGHT * share * (1 - share) * colors)
+    p = a[9] / mass
+    q = 1 - p
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    log_area = _log_area(
+        p * a[3] + q * b[3] + p * q * (x * x),
+        p * a[4] + q * b[4] + p * q * (x * y),
+        p * a[5] + q * b[5] + p * q * (x * z),
+        p * a[6] + q * b[6] + p * q * (y * y),
+        p * a[7] + q * b[7] + p * q * (y * z),
+        p * a[8] + q * b[8] + p * q * (z * z),
+    )
+    color = 0.0
+    for k in range(10, a.shape[0]):
+        color += (a[k] - b[k]) ** 2
+    loss = log_area - p * log_areas[first] - q * log_areas[second]
+    return mass * (loss + COLOR_WEIGHT * p * q * color)
 
 
-def _log_areas(covariances: np.ndarray) -> np.ndarray:
-    """Return half the log of the second invariant of covariances (6, ...); log(s1 s2) for a flat splat."""
-    xx, xy, xz, yy, yz, zz = covariances
-    return np.log(np.maximum(xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz, 1e-120)) / 2
+@kernel(STRICT)
+def _fill_errors(begin, end, moments, log_areas, first, second, errors):
+    for i in range(begin, end):
+        errors[i] = _pair_error(moments, log_areas, first[i], second[i])
+
+
+@kernel(STRICT)
+def _choose_partners(begin, end, moments, log_areas, neighbors, partners, costs):
+    """Fill the cheapest partner of each row among its neighbors (N, K), and the cost of the pair."""
+    for i in range(begin, end):
+        partners[i], costs[i] = neighbors[i, 0], math.inf
+        for j in neighbors[i]:
+            if j != i:
+                cost = _pair_error(moments, log_areas, min(i, j), max(i, j))
+                if cost < costs[i]:
+                    partners[i], costs[i] = j, cost
 
 
 def _merged_splats(splats: Splats, masses: np.ndarray, members: np.ndarray, moments: np.ndarray) -> Splats:
