@@ -138,16 +138,18 @@ class Model:
     @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
         """Remove the rows where ``mask`` (N,), on any device, is False."""
-        mask = mask.to(self._adam.tensors["means"].device)
-        if not mask.any():
+        if mask.all():
+            return
+        rows = torch.nonzero(mask.to(self._adam.tensors["means"].device)).squeeze(1)
+        if not len(rows):
             self._copy_to_host()
-        if self._device_model is not None and not mask.all():
-            self._device_model.select(torch.nonzero(mask).squeeze(1))
+        if self._device_model is not None:
+            self._device_model.select(rows)
         for name in self._host_tensors:
-            first, second = self._adam.state[name]
-            self._replace(name, self._adam.tensors[name][mask], first[mask], second[mask])
+            tensors = self._adam.tensors[name], *self._adam.state[name]
+            self._replace(name, *(tensor.index_select(0, rows) for tensor in tensors))
         for table in self._host_columns:
-            table.update({name: column[mask] for name, column in table.items()})
+            table.update({name: column.index_select(0, rows) for name, column in table.items()})
 
     @torch.no_grad()
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:

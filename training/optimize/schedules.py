@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable
+from functools import lru_cache
 from itertools import accumulate
 from math import ceil, inf, sqrt
 
@@ -86,6 +87,7 @@ class ShSchedule:
         return min(self.degree, (self.completed + step) // self._interval)
 
 
+@lru_cache(1 << 13)  # image reading asks for coming steps, too
 def random_reduction(seed: int, step: int) -> float:
     """Draw the factor by which the image of a step that refines a merged level is reduced, mostly 1."""
     rng = np.random.default_rng([seed, step, 21])

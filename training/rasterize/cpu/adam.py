@@ -92,6 +92,8 @@ def rate_rows(
 ) -> np.ndarray:
     """Return the rates of ``count`` rows of this shape, flat, with the first moment's bias correction."""
     rate = np.asarray(lr, np.float32) / np.float32(1 - betas[0] ** step)
+    if rate.ndim == 0:
+        return np.full(math.prod(shape) * count, rate)
     return np.tile(np.broadcast_to(rate, shape).reshape(-1), count)
 
 
