@@ -385,9 +385,10 @@ def put_level(
         item.lost = _carry_over(old_cloud, new_object.data)
         obj.data, obj.color = new_object.data, new_object.color
         bpy.data.objects.remove(new_object)
-        name = old_cloud.name
-        bpy.data.pointclouds.remove(old_cloud)
-        obj.data.name = name
+        if not old_cloud.users:  # linked duplicates keep it
+            name = old_cloud.name
+            bpy.data.pointclouds.remove(old_cloud)
+            obj.data.name = name
         new_object = obj
     if not new_object.users_collection:  # an existing object keeps its parent, or none after Alt-P
         new_object.parent = axes_of(root)

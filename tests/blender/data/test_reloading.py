@@ -109,6 +109,14 @@ def test_levels_keep_their_objects(bpy, lodgs, tmp_path):
     assert root.lodgs.single_level == 2 and not items[0].show
 
 
+def test_linked_duplicates_keep_their_splats(bpy, root, path):
+    duplicate = root.lodgs.levels[0].object.copy()
+    bpy.context.scene.collection.objects.link(duplicate)
+    write_ply(path, cube(60))
+    assert bpy.ops.lodgs.reload_splats() == {"FINISHED"}
+    assert len(duplicate.data.points) == 50 and len(root.lodgs.levels[0].object.data.points) == 60
+
+
 def wait_for_reload(reloading, root) -> None:
     for _ in range(4):
         reloading.check_files()
