@@ -9,6 +9,7 @@ import bpy
 from ...training.lod.rule import Control, Rule, resolve_rule, rules
 from ..nodes.camera_choices import CHOICES, find_choice
 from .metadata import read_json
+from .objects import root_of
 from .property_callbacks import look_up, tag_owner
 from .setting_properties import SUBTYPES
 from .training_settings import TrainingSettings
@@ -80,8 +81,14 @@ class SplatLevel(bpy.types.PropertyGroup):
 
     @property
     def exists(self) -> bool:
-        """False if the artist deleted the level's object or changed its type; the list keeps the entry."""
-        return _is_in_collection(self.object, "POINTCLOUD")
+        """False if the artist deleted the level's object, changed its type or copied the root without it.
+
+        The list keeps the entry.
+        """
+        if not _is_in_collection(self.object, "POINTCLOUD"):
+            return False
+        owner = root_of(self.object)
+        return owner is None or owner.original == self.id_data.original
 
 
 class SplatTable(bpy.types.PropertyGroup):

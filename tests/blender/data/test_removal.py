@@ -133,6 +133,19 @@ def test_duplicate_root_is_removed_without_the_original(bpy, lodgs, root):
     assert data_names(bpy)["objects"] == before["objects"]
 
 
+def test_copy_of_a_root_alone_leaves_the_levels_to_the_original(bpy, lodgs, root):
+    """The copy references the same levels, but has no crops."""
+    crops = lodgs("data.crops").crops_of(root)
+    for obj in bpy.context.view_layer.objects:
+        obj.select_set(obj == root)
+    bpy.context.view_layer.objects.active = root
+    bpy.ops.object.duplicate()
+    bpy.context.view_layer.update()
+    followed_objects = lodgs("data.crops").followed_objects
+    assert crops and all(followed_objects(item.object) == crops for item in root.lodgs.levels)
+    assert len(root.lodgs.existing_levels) == 2 and not bpy.context.active_object.lodgs.existing_levels
+
+
 def test_animated_cameras_are_removed_with_their_scene(bpy, lodgs, root):
     """Objects of the user are kept."""
     before = data_names(bpy)["objects"]
