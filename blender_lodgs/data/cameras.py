@@ -36,12 +36,13 @@ def scene_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     """Return the active camera object of a scene.
 
     Raises:
-        LodgsError: the scene has no camera.
+        LodgsError: the scene has no camera, or another object as its camera.
     """
+    remedy = "Add a camera, or look through one of the views."
     if scene.camera is None:
-        raise LodgsError(
-            "Cannot render: the scene has no camera.", "Add a camera, or look through one of the views."
-        )
+        raise LodgsError("Cannot render: the scene has no camera.", remedy)
+    if scene.camera.type != "CAMERA":
+        raise LodgsError(f"Cannot render: the scene's camera '{scene.camera.name}' is not a camera.", remedy)
     return scene.camera
 
 

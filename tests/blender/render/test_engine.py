@@ -501,6 +501,15 @@ def test_render_without_a_trainer_is_reported(bpy, lodgs, scene, tmp_path, monke
     assert not (tmp_path / "none.png").exists()
 
 
+def test_other_objects_as_camera_are_rejected(bpy, lodgs, scene, monkeypatch):
+    monkeypatch.setattr(lodgs("render.viewport_quality"), "_require_graphics", lambda: None)
+    scene.camera = bpy.data.objects.new("empty", None)
+    scene.collection.objects.link(scene.camera)
+    for render in (bpy.ops.render.render, bpy.ops.lodgs.render_quick):
+        with pytest.raises(RuntimeError, match="the scene's camera 'empty' is not a camera"):
+            render()
+
+
 def test_unsupported_lenses_are_rejected(bpy, scene):
     scene.camera.data.type, scene.camera.data.panorama_type = "PANO", "FISHEYE_EQUISOLID"
     with pytest.raises(RuntimeError, match="'camera' is a panoramic camera of the type Fisheye Equisolid"):
