@@ -40,7 +40,8 @@ MIN_ELEVATION = 0.0
 """Sine of a dome's lowest elevation: objects stand on the ground."""
 CLIP_START = 0.1
 """Maximum clip start of cameras along a curve, as Blender's default; at most a quarter of their spacing."""
-_SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
+SOLID = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "POINTCLOUD", "CURVES"}
+"""Types of objects with surfaces or volumes."""
 
 Shot = bpy.types.Object | int | tuple[Camera, float]
 """Camera of an image: a camera object, a frame of the active camera, or a placed view and its near depth."""
@@ -279,7 +280,7 @@ def selected_subjects(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 def is_renderable(obj: bpy.types.Object) -> bool:
     """Return whether an object outside splat scenes has surfaces or volumes, or instances a collection."""
-    return root_of(obj) is None and (obj.type in _SOLID or obj.instance_type == "COLLECTION")
+    return root_of(obj) is None and (obj.type in SOLID or obj.instance_type == "COLLECTION")
 
 
 def _corners(context: bpy.types.Context) -> np.ndarray:
@@ -311,7 +312,7 @@ def _boxes(
             continue
         evaluated = obj.evaluated_get(depsgraph)
         matrix = transform @ evaluated.matrix_world if transform else evaluated.matrix_world
-        if obj.type in _SOLID:
+        if obj.type in SOLID:
             world = np.array(matrix)
             yield np.array(evaluated.bound_box, np.float64) @ world[:3, :3].T + world[:3, 3]
         if obj.instance_type == "COLLECTION" and obj.instance_collection is not None:

@@ -13,7 +13,7 @@ from ...training.errors import LodgsError
 from .. import compat
 from ..data.cameras import scene_camera
 from ..data.paths import relative_path
-from ..data.viewpoints import is_renderable
+from ..data.viewpoints import SOLID, is_renderable
 from . import compositing, engine
 from .written_images import require_complete_image
 
@@ -44,7 +44,7 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
     meshes = bpy.data.scenes.new(f"{scene.name} Depth")
     try:
         compositing.copy_settings(scene, meshes, catchers=False)
-        if not any(is_renderable(obj) for obj in meshes.view_layers[0].objects):
+        if not any(map(_has_depth, meshes.view_layers[0].objects)):
             raise LodgsError(
                 f"Cannot render mesh depth: the scene '{scene.name}' has no meshes.",
                 "Add a mesh outside the collections of the splats.",
@@ -67,6 +67,12 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
     scene.lodgs_render.holdout = relative_path(str(pattern))
     if scene.lodgs_render.meshes is not None:
         compositing.combine_with_meshes(scene)
+
+
+def _has_depth(obj: bpy.types.Object) -> bool:
+    """Return whether an object has depth: outside splat scenes, or one of the user below a root."""
+    has_surfaces = obj.type in SOLID - {"POINTCLOUD"} or obj.instance_type == "COLLECTION"
+    return is_renderable(obj) or (has_surfaces and not obj.hide_render)
 
 
 def depth_file_pattern(scene: bpy.types.Scene) -> Path:

@@ -25,6 +25,15 @@ def test_depth_of_an_unsaved_file_is_in_a_private_folder(bpy, lodgs, monkeypatch
     mesh_depth._temporary_folder.cache_clear()
 
 
+def test_meshes_below_the_root_of_splats_have_depth(bpy, lodgs):
+    root = bpy.data.objects.new("root", None)
+    root.lodgs.is_root = True
+    mesh = bpy.data.objects.new("mesh", bpy.data.meshes.new("mesh"))
+    mesh.parent = root
+    has_depth = lodgs("render.mesh_depth")._has_depth
+    assert has_depth(mesh) and not has_depth(root)
+
+
 def test_scene_without_meshes_has_no_depth(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "splats.ply", Bundle("", [Level(1, splats(10))]))
     lodgs("data.importing").import_splats(bpy.context, tmp_path / "splats.ply")
