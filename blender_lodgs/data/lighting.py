@@ -38,6 +38,8 @@ def _lamp_irradiance(lamp: bpy.types.Light, matrix, position: Vector) -> np.ndar
     color = np.array(lamp.color) * lamp.energy * 2 ** getattr(lamp, "exposure", 0.0)
     if lamp.use_temperature:
         color *= lamp.temperature_color
+    if not getattr(lamp, "normalize", True):
+        color *= _emitting_area(lamp, matrix)
     if lamp.type == "SUN":
         return color
     offset = position - matrix.translation
@@ -48,6 +50,17 @@ def _lamp_irradiance(lamp: bpy.types.Light, matrix, position: Vector) -> np.ndar
     if lamp.type == "SPOT" and cosine < np.cos(lamp.spot_size / 2):
         return np.zeros(3)
     return color / (4 * np.pi * distance2)
+
+
+def _emitting_area(lamp: bpy.types.Light, matrix) -> float:
+    """Return the area of a lamp or the solid angle of a sun, by which it is brighter without *Normalize*."""
+    if lamp.type == "SUN":
+        return np.pi * np.sin(lamp.angle / 2) ** 2 or 1.0
+    if lamp.type != "AREA":
+        return 4 * (np.pi * lamp.shadow_soft_size**2 or 1.0)
+    height = lamp.size_y if lamp.shape in ("RECTANGLE", "ELLIPSE") else lamp.size
+    x, y, _ = matrix.to_scale()
+    return lamp.size * x * height * y * (np.pi / 4 if lamp.shape in ("DISK", "ELLIPSE") else 1)
 
 
 def _world_radiance(world: bpy.types.World | None) -> np.ndarray:

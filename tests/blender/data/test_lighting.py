@@ -47,6 +47,32 @@ def test_lamps_give_their_irradiance(bpy, lodgs, scene, kind, energy, location, 
     np.testing.assert_allclose(light(bpy, lodgs), np.array([1, 0.5, 0.25]) * expected / 4, rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("kind", "settings", "area"),
+    [
+        ("AREA", {"shape": "RECTANGLE", "size": 0.1, "size_y": 0.2}, 0.12),
+        ("AREA", {"shape": "ELLIPSE", "size": 0.1, "size_y": 0.2}, 0.12 * np.pi / 4),
+        ("POINT", {"shadow_soft_size": 0.1}, 0.04 * np.pi),
+        ("POINT", {"shadow_soft_size": 0}, 4),
+        ("SUN", {"angle": 0.3}, np.pi * np.sin(0.15) ** 2),
+        ("SUN", {"angle": 0}, 1),
+    ],
+)
+def test_lamps_without_normalize_grow_brighter_with_their_size(bpy, lodgs, scene, kind, settings, area):
+    """The factors are those of renders of Cycles."""
+    obj = add_lamp(bpy, kind, (1, 1, 1), 100, (0, 0, 5))
+    if not hasattr(obj.data, "normalize"):
+        pytest.skip("Blender before 4.5 normalises all lamps")
+    for name, value in settings.items():
+        setattr(obj.data, name, value)
+    obj.scale = (2, 3, 1)
+    bpy.context.view_layer.update()
+    normalized = light(bpy, lodgs)
+    obj.data.normalize = False
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(light(bpy, lodgs), normalized * area, rtol=1e-5)
+
+
 def test_temperature_colours_a_lamp(bpy, lodgs, scene):
     lamp = add_lamp(bpy, "SUN", (1, 1, 0.5), 4.0).data
     lamp.use_temperature, lamp.temperature = True, 2700
