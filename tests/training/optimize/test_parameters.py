@@ -1,5 +1,6 @@
 """Tests of parameter declarations and of values from jobs."""
 
+import re
 from dataclasses import dataclass, fields
 
 import pytest
@@ -30,6 +31,13 @@ def test_parameters_have_help_and_presets_are_valid(method):
         assert override(values, {}) == values and values.total_steps > 0
         for f in fields(values):
             assert type(getattr(values, f.name)) is type(f.default)
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=lambda method: method.name)
+def test_tooltips_of_the_panel_name_only_its_parameters(method):
+    about = {f.name: f.metadata["about"] for f in fields(method.parameters)}
+    named = {word for name in method.panel_parameters for word in re.findall(r"'(\w+)'", about[name])}
+    assert named & about.keys() <= set(method.panel_parameters)
 
 
 def test_method_numbers_are_unique_and_stable():

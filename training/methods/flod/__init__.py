@@ -32,8 +32,7 @@ class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
     footprint: float = setting(
         16.0,
         "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda). "
-        "Sets the distances of trained levels, and in regions and cells those of merged levels, which "
-        "otherwise follow from 'drawn'.",
+        "Sets the distances of trained levels, and in regions and cells those of merged levels.",
         label="Coarsest Detail",
         above=0,
         unit="px",

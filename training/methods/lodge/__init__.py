@@ -50,8 +50,7 @@ class LodgeParameters(SplatParameters):
     drawn: float = setting(
         0.59,
         "Maximum number of splats drawn by distance in the training views, as a fraction of those of "
-        "the finest level; above it, 'prune_weight' increases for the level. 1 disables. Not in the "
-        "paper.",
+        "the finest level; above it, more of the level is pruned. 1 disables. Not in the paper.",
         above=0,
         high=1,
     )
@@ -85,7 +84,7 @@ class LodgeParameters(SplatParameters):
     chunks: int = setting(
         0,
         "Number of chunks: fixed splat sets that blend into each other as the camera moves. 0 uses "
-        "LODGE's Eq. 5, and none below 'min_chunks'; 1 disables chunks.",
+        "LODGE's Eq. 5, and no chunks where it gives few; 1 disables chunks.",
         high=96,
     )
     min_chunks: int = setting(
