@@ -20,8 +20,8 @@ const JOB_TYPE = {
           description: "Training method" },
         { key: "preset", type: "string", default: "draft", choices: ["draft", "standard", "paper"],
           description: "Preset: draft trains for minutes, paper for hours" },
-        { key: "image_scale", type: "float", default: 0.5, propargs: { min: 0.01, max: 1 },
-          description: "Size of training images relative to the photos" },
+        { key: "image_scale", type: "float", default: 0, propargs: { min: 0, max: 1 },
+          description: "Size of training images relative to the photos; 0 uses that of the preset" },
         { key: "polish", type: "int32", default: 300, propargs: { min: 0 },
           description: "Steps that fit each cell's borders to its neighbours; 0 disables" },
         { key: "options", type: "string", default: "",
@@ -35,7 +35,8 @@ function compileJob(job) {
     const { scene, output, columns, rows, method, preset, image_scale, polish, options, lodgs } = job.settings;
     const plan = task(job, "plan", lodgs, [
         "blocks", "plan", scene, "--out", output, "--cells", `${columns}x${rows}`,
-        "--method", method, "--preset", preset, "--image-scale", `${image_scale}`, "--polish", `${polish}`,
+        "--method", method, "--preset", preset, "--polish", `${polish}`,
+        ...(image_scale ? ["--image-scale", `${image_scale}`] : []),
         ...(options ? shellSplit(options) : []),
     ]);
     const numbers = Array.from({ length: columns * rows }, (_, index) => index + 1);

@@ -86,6 +86,15 @@ def test_extra_options_apply_to_the_plan(tmp_path):
 
 
 @needs_node
+def test_form_has_the_image_scale_of_the_preset(tmp_path):
+    def options_of_plan(**settings) -> list[str]:
+        return compiled(tmp_path, preset="paper", **settings)["tasks"][0]["commands"][0]["args"]
+
+    assert "--image-scale" not in options_of_plan()
+    assert options_of_plan(image_scale=0.25)[-2:] == ["--image-scale", "0.25"]
+
+
+@needs_node
 def test_settings_match_methods_and_presets(tmp_path):
     settings = {setting["key"]: setting for setting in compiled(tmp_path)["type"]["settings"]}
     assert set(settings["method"]["choices"]) == {name for name, info in METHODS.items() if info.cell_method}
