@@ -27,6 +27,13 @@ _SEEK_TABLE_END = b"\xb1\xea\x92\x8f"
 """Last bytes of a compressed .blend file, from the seekable format of Zstandard."""
 
 
+def library_of(datablock: bpy.types.ID) -> bpy.types.Library | None:
+    """Return the library whose folder the paths of a datablock are relative to, also for an override."""
+    override = datablock.override_library
+    reference = override.reference if override is not None else None
+    return datablock.library if reference is None else reference.library
+
+
 def absolute_path(value: str, library: bpy.types.Library | None = None) -> Path:
     """Return a path of the .blend file or of a user, to open it on the user's request.
 

@@ -14,7 +14,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from .. import extension
-from . import importing, scenes
+from . import importing, roots, scenes
 from .importing import SplatsFile, file_stamp
 from .paths import absolute_path, automatic_path
 
@@ -113,7 +113,7 @@ def watch_of(root: bpy.types.Object) -> FileWatch | None:
 def check_files() -> float:
     """Reload the watched scenes whose files have changed, one step at a time; return INTERVAL."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.is_root and obj.lodgs.source.watch]:
-        if root.is_editable and root.users_scene:
+        if roots.is_local(root) and root.users_scene:
             _check(root, _watches.setdefault(root.session_uid, FileWatch(root.lodgs.source.file_version)))
     return INTERVAL
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 
 from ..attributes import HIDDEN
-from .paths import absolute_path, automatic_path, stored_path
+from .paths import absolute_path, automatic_path, library_of, stored_path
 
 RESIDENT_SHARE = 0.25
 """Share of the budget for the scene's own objects."""
@@ -68,7 +68,7 @@ def file_of(root: bpy.types.Object) -> Path | None:
         LodgsError: the path names a device.
     """
     file = root.lodgs.stream.file
-    return absolute_path(file, root.library) if file else None
+    return absolute_path(file, library_of(root)) if file else None
 
 
 def source_of(root: bpy.types.Object) -> Source | None:
@@ -79,7 +79,7 @@ def source_of(root: bpy.types.Object) -> Source | None:
         computer, see ``automatic_path``.
     """
     settings = root.lodgs
-    path = automatic_path(settings.stream.file, root.library)
+    path = automatic_path(settings.stream.file, library_of(root))
     if path is None or settings.mode != "SELECTIVE" or is_edited(root):
         return None
     stream = settings.stream

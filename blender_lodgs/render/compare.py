@@ -17,7 +17,7 @@ from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
 from .. import extension
 from ..data import cameras, photographs
-from ..data.paths import absolute_path
+from ..data.paths import absolute_path, library_of
 from ..viewport import wipe
 from ..viewport.wipe import Comparison
 from . import engine, renderer
@@ -74,8 +74,8 @@ def compare_view(
             camera,
             near,
             background=(0.0, 0.0, 0.0),
-            photograph=absolute_path(facts.photograph),
-            mask=absolute_path(facts.mask) if facts.mask else None,
+            photograph=absolute_path(facts.photograph, library_of(view.data)),
+            mask=absolute_path(facts.mask, library_of(view.data)) if facts.mask else None,
         )
         frame = renderer.draw_frame(engine.placed_splats(depsgraph), frame_view, on_progress)
     if frame is None:

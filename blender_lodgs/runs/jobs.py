@@ -22,7 +22,7 @@ from ...training.scenes.cameras import Camera, write_camera
 from ...training.splats.bundle import write_bundle
 from ...training.splats.levels import Bundle
 from .. import extension
-from ..data import cells, scenes, viewpoints
+from ..data import cells, roots, scenes, viewpoints
 from ..data.paths import absolute_path, automatic_path
 from . import environment, processes
 from .job_settings import make_job
@@ -330,7 +330,7 @@ def _launch(
 
 def reattach() -> None:
     """Attach to the runs of all scene roots that are not watched: after enabling, loading, undo and redo."""
-    for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run and obj.is_editable]:
+    for root in [obj for obj in bpy.data.objects if obj.lodgs.training.run and roots.is_local(obj)]:
         if watch_of(root) is None and automatic_path(root.lodgs.training.run):
             with suppress(LodgsError):  # the panel reports a missing folder
                 watch = attach(root, root.lodgs.training.run, reload=False)

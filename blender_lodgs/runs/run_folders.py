@@ -12,7 +12,7 @@ import bpy
 from ...training.errors import LodgsError
 from ...training.runs.folder import RunFolder
 from ...training.runs.job import Job
-from ..data.paths import absolute_path, automatic_path, relative_path
+from ..data.paths import absolute_path, automatic_path, library_of, relative_path
 
 LOG = "LODGS trainer log"
 """Name of the text block that shows a trainer's log."""
@@ -39,7 +39,7 @@ def run_folder(root: bpy.types.Object) -> RunFolder | None:
 
 def automatic_run(root: bpy.types.Object) -> RunFolder | None:
     """Return the folder of the root's newest run, or None as ``automatic_path``."""
-    path = automatic_path(root.lodgs.training.run)
+    path = automatic_path(root.lodgs.training.run, library_of(root))
     return RunFolder(path.resolve()) if path else None
 
 

@@ -136,6 +136,39 @@ def test_local_files_and_the_share_of_the_blend_are_opened(bpy, lodgs, saved, tm
     assert paths.automatic_path(r"\\nas\other\run") is None
 
 
+@pytest.mark.parametrize("override", [False, True])
+def test_relative_paths_of_linked_scenes_lead_to_their_library(
+    bpy, lodgs, saved, tmp_path, monkeypatch, override
+):
+    view = lodgs("data.photographs").views(saved)[0]
+    saved.lodgs.stream.file, view.data.lodgs.photograph = "//town.ply", "//images/view.jpg"
+    saved.lodgs.source.file, saved.lodgs.source.watch = "//town.ply", True
+    name, view_name = saved.users_collection[0].name, view.name
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
+    with bpy.data.libraries.load(str(tmp_path / "a" / "file.blend"), link=True) as (_, linked):
+        linked.collections = [name]
+    scene, [collection] = bpy.context.scene, linked.collections
+    scene.collection.children.link(collection)
+    if override:
+        collection.override_hierarchy_create(scene, bpy.context.view_layer)
+        scene.collection.children.unlink(collection)
+    bpy.context.view_layer.update()
+    [root] = lodgs("data.roots").roots(scene)
+    photos, compare = [], lodgs("render.compare")
+    monkeypatch.setattr(
+        lodgs("render.renderer"), "draw_frame", lambda sets, view, _: photos.append(view.photograph)
+    )
+    compare.compare_view(bpy.context, root, scene.objects[view_name])
+    assert photos == [tmp_path / "a" / "images" / "view.jpg"]
+    assert lodgs("data.streams").file_of(root) == tmp_path / "a" / "town.ply"
+    assert lodgs("runs.run_folders").automatic_run(root).path == tmp_path / "a" / "runs" / "one"
+    lodgs("data.reloading").check_files()
+    lodgs("runs.jobs").reattach()
+    assert lodgs("data.reloading").watch_of(root) is None and lodgs("runs.watch").watch_of(root) is None
+
+
 def test_hostile_paths_of_a_file_open_nothing(bpy, lodgs, saved, monkeypatch):
     """Viewports, panels and menus draw without a request of the user."""
     folders, streams = lodgs("runs.run_folders"), lodgs("data.streams")
