@@ -14,7 +14,7 @@ import bpy
 
 from ...training.errors import LodgsError
 from .. import extension
-from . import importing, roots, scenes
+from . import importing, photographs, roots, scenes
 from .importing import SplatsFile, file_stamp
 from .paths import absolute_path, automatic_path
 
@@ -80,7 +80,11 @@ def replace_splats(root: bpy.types.Object, file: SplatsFile) -> list[str]:
     deleted = 0 if settings.stream.file else settings.source.count - previous
     scenes.check_facts(root, file.bundle)
     shown_level, watch = settings.single_level, settings.source.watch
+    views = [view.data.lodgs for view in photographs.views(root)]
+    held_out = [(view, view.held_out) for view in views if view.is_property_set("held_out")]
     importing.refill(root, file)
+    for view, value in held_out:  # the views stay
+        view.held_out = value
     importing.set_source(root, file)
     settings.source.watch = watch
     if existing and shown_level != finest:

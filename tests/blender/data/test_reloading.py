@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from training.scenes.cameras import Camera
+from training.scenes.view_tables import make_view_tables
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
@@ -115,6 +117,15 @@ def test_linked_duplicates_keep_their_splats(bpy, root, path):
     write_ply(path, cube(60))
     assert bpy.ops.lodgs.reload_splats() == {"FINISHED"}
     assert len(duplicate.data.points) == 50 and len(root.lodgs.levels[0].object.data.points) == 60
+
+
+def test_views_stay_held_out(bpy, lodgs, tmp_path):
+    cameras = [Camera(name, 40, 30, 30.0, 30.0, 20.0, 15.0, np.eye(4)) for name in ("a", "b")]
+    path = tmp_path / "views.ply"
+    write_bundle(path, Bundle("", [Level(1, cube(5))], tables=make_view_tables(cameras, 0.1, {"b"})))
+    root, photographs = lodgs("data.importing").import_splats(bpy.context, path), lodgs("data.photographs")
+    assert bpy.ops.lodgs.reload_splats() == {"FINISHED"}
+    assert [view.name for view in photographs.held_out(root)] == ["b"]
 
 
 def wait_for_reload(reloading, root) -> None:
