@@ -268,7 +268,7 @@ def visible_splats(
             placed splats also if the root is scaled differently along its axes.
     """
     levels = [item.object for item in root.lodgs.existing_levels]
-    with _without_native_drawing(context), display.with_all_attributes(context, levels):
+    with without_native_drawing(context), display.with_all_attributes(context, levels):
         depsgraph = context.evaluated_depsgraph_get()
         parts = [
             objects.read_splats(item.object, depsgraph)
@@ -294,7 +294,7 @@ def visible_splats(
 
 
 @contextmanager
-def _without_native_drawing(context: bpy.types.Context) -> Iterator[None]:
+def without_native_drawing(context: bpy.types.Context) -> Iterator[None]:
     """Evaluate objects without the modifiers that apply weights and looks for Blender's own drawing."""
     settings = context.scene.lodgs_viewport
     previous = settings.splats, settings.drawn_by

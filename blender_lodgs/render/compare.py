@@ -16,7 +16,7 @@ from ...training.color import srgb_from_linear
 from ...training.errors import LodgsError
 from ...training.scenes.cameras import Camera
 from .. import extension
-from ..data import cameras, photographs
+from ..data import cameras, photographs, scenes
 from ..data.paths import absolute_path, library_of
 from ..viewport import wipe
 from ..viewport.wipe import Comparison
@@ -67,7 +67,8 @@ def compare_view(
     full_size = Camera(view.name, facts.width, facts.height, facts.fx, facts.fy, 0, 0, np.eye(4))
     # the value as typed, which the job has: Blender stores it rounded to 32 bits
     scale = float(str(np.float32(root.lodgs.training.image_scale)))
-    with _render_settings(scene, view, full_size.scaled(scale)) as (width, height):
+    settings = _render_settings(scene, view, full_size.scaled(scale))
+    with scenes.without_native_drawing(context), settings as (width, height):
         depsgraph = context.evaluated_depsgraph_get()
         camera, near = cameras.view_of(view.evaluated_get(depsgraph), depsgraph, width, height)
         frame_view = renderer.FrameView(

@@ -68,6 +68,27 @@ def test_measuring_continues_in_another_blender_scene(bpy, lodgs, root, monkeypa
     assert bpy.context.scene.camera is None and root.users_scene[0].camera == camera
 
 
+@pytest.mark.parametrize("drawn_by", ["LODGS", "BLENDER"])
+def test_look_applies_once_to_splats_with_modifiers(bpy, lodgs, root, monkeypatch, drawn_by):
+    """Where Blender draws viewports itself, modifiers apply the look as well."""
+    if lodgs("compat").NATIVE_SPLATS is None:
+        pytest.skip("Blender before 5.3 has no splats")
+    group = bpy.data.node_groups.new("pass on", "GeometryNodeTree")
+    for kind, direction in (("NodeGroupInput", "INPUT"), ("NodeGroupOutput", "OUTPUT")):
+        group.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+        group.nodes.new(kind)
+    group.links.new(group.nodes[0].outputs[0], group.nodes[1].inputs[0])
+    root.lodgs.levels[0].object.modifiers.new("mine", "NODES").node_group = group
+    root.lodgs_look.exposure, bpy.context.scene.lodgs_viewport.drawn_by = 1.0, drawn_by
+    drawn = []
+    monkeypatch.setattr(
+        lodgs("render.renderer"), "draw_frame", lambda sets, view, _: drawn.append(sets[0].read()[0].sh)
+    )
+    lodgs("render.compare").compare_view(bpy.context, root, lodgs("data.photographs").views(root)[0])
+    np.testing.assert_allclose(drawn[0], haze(0.4).sh, atol=1e-6)
+    assert bpy.context.scene.lodgs_viewport.drawn_by == drawn_by
+
+
 def test_psnr_matches_a_render(bpy, lodgs, root, renderer, tmp_path):
     scene, view = bpy.context.scene, lodgs("data.photographs").views(root)[5]
     lodgs("data.photographs").use_view(bpy.context, view)
