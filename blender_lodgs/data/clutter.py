@@ -185,6 +185,8 @@ def register() -> None:
 
 
 def unregister() -> None:
+    if bpy.app.timers.is_registered(_refresh_all):
+        bpy.app.timers.unregister(_refresh_all)
     for name, handler in _HANDLERS.items():
         getattr(bpy.app.handlers, name).remove(handler)
     del bpy.types.Object.lodgs_clutter

@@ -156,6 +156,8 @@ class Measurement:
 
     def step(self) -> bool:
         """Measure one view. Return whether more views remain."""
+        if measurement is not self:  # another file is open, or the extension is disabled
+            return False
         objects = {obj.session_uid: obj for obj in bpy.data.objects}
         root = objects.get(self._root)
         try:
@@ -222,3 +224,4 @@ def register() -> None:
 
 def unregister() -> None:
     bpy.app.handlers.load_post.remove(_on_load)
+    _on_load()

@@ -166,6 +166,8 @@ def unregister() -> None:
     for changes in (handlers.undo_post, handlers.redo_post):
         changes.remove(_on_undo)
     handlers.load_pre.remove(_on_file)
+    if bpy.app.timers.is_registered(_store_shading):
+        bpy.app.timers.unregister(_store_shading)
     _on_load()
     shaders.clear()
     views.stop()

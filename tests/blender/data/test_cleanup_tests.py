@@ -148,3 +148,13 @@ def test_preview_follows_the_rotation_and_ends_if_the_scene_is_stretched(bpy, lo
     bpy.context.view_layer.update()
     clutter._refresh_all()
     assert not root.lodgs_clutter.preview
+
+
+def test_no_timer_remains_without_the_extension(bpy, lodgs):
+    clutter = lodgs("data.clutter")
+    clutter.refresh_later()
+    clutter.unregister()
+    try:
+        assert not bpy.app.timers.is_registered(clutter._refresh_all)
+    finally:
+        clutter.register()

@@ -68,6 +68,16 @@ def test_measuring_continues_in_another_blender_scene(bpy, lodgs, root, monkeypa
     assert bpy.context.scene.camera is None and root.users_scene[0].camera == camera
 
 
+def test_measuring_ends_with_the_extension(bpy, lodgs, root):
+    compare = lodgs("render.compare")
+    measurement = compare.measure(bpy.context, root)
+    compare.unregister()
+    try:
+        assert not measurement.step() and measurement.done == 0
+    finally:
+        compare.register()
+
+
 @pytest.mark.parametrize("drawn_by", ["LODGS", "BLENDER"])
 def test_look_applies_once_to_splats_with_modifiers(bpy, lodgs, root, monkeypatch, drawn_by):
     """Where Blender draws viewports itself, modifiers apply the look as well."""
