@@ -332,7 +332,7 @@ def bounds(root: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
         LodgsError: the scene has neither splats nor points.
     """
     objects = [item.object for item in root.lodgs.existing_levels] or [root.lodgs.points]
-    if objects[-1] is None:
+    if objects[-1] is None or not len(objects[-1].data.points):
         raise LodgsError(
             f"Cannot measure '{root.name}': it has neither splats nor points.",
             "Import or train splats first.",

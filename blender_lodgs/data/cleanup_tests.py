@@ -221,8 +221,16 @@ def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
 
 
 def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
-    """Return the subject of the finest level, in the scene's coordinates; the last result is cached."""
+    """Return the subject of the finest level, in the scene's coordinates; the last result is cached.
+
+    Raises:
+        LodgsError: the finest level has no splats, or the root is scaled differently along its axes.
+    """
     cloud = root.lodgs.existing_levels[-1].object.data
+    if not len(cloud.points):
+        raise LodgsError(
+            f"Cannot find clutter: the finest level of '{root.name}' has no splats.", "Undo their removal."
+        )
     up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)
     key = cloud.session_uid, len(cloud.points), changes.version(cloud), tuple(up)
     if not _subject or _subject[0] != key:
