@@ -162,12 +162,11 @@ def camera_query(instance: SplatInstance, depsgraph: bpy.types.Depsgraph) -> sel
     root, camera = roots.root_of(instance.object), depsgraph.scene.camera
     if query is None or not query.rule or instance.source is None or root is None or camera is None:
         return query and at_instance(query, instance)
-    settings = root.lodgs
+    settings = root.evaluated_get(depsgraph).lodgs
     if settings.follows_viewport:
         location = camera.evaluated_get(depsgraph).matrix_world.translation
         position = tuple(axes_of(root).evaluated_get(depsgraph).matrix_world.inverted_safe() @ location)
-        focal_px = root.evaluated_get(depsgraph).lodgs.focal_px
-        query = replace(query, position=position, focal_px=focal_px)
+        query = replace(query, position=position, focal_px=settings.focal_px)
     return at_instance(query, instance)
 
 
@@ -187,7 +186,11 @@ def at_instance(query: selection.LodQuery, instance: SplatInstance) -> selection
 
 def _with_sources(instances: list[SplatInstance], depsgraph: bpy.types.Depsgraph) -> list[SplatInstance]:
     """Add sources to instances whose levels share one transform and have no modifiers of artists."""
-    sources = {root: source for root in roots.roots(depsgraph.scene) if (source := streams.source_of(root))}
+    sources = {
+        root: source
+        for root in roots.roots(depsgraph.scene)
+        if (source := streams.source_of(root, depsgraph))
+    }
     if not sources:
         return instances
     root_of_level = {item.object: root for root in sources for item in root.lodgs.existing_levels}

@@ -71,16 +71,19 @@ def file_of(root: bpy.types.Object) -> Path | None:
     return absolute_path(file, library_of(root)) if file else None
 
 
-def source_of(root: bpy.types.Object) -> Source | None:
+def source_of(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Source | None:
     """Return the source of a scene's finer splats.
+
+    Args:
+        depsgraph: use animated settings as evaluated in it; None for the original ones.
 
     Returns:
         None if the scene has all splats, shows a single level, or was edited, or if its file is on another
         computer, see ``automatic_path``.
     """
-    settings = root.lodgs
+    settings, evaluated = root.lodgs, root.evaluated_get(depsgraph) if depsgraph else root
     path = automatic_path(settings.stream.file, library_of(root))
-    if path is None or settings.mode != "SELECTIVE" or is_edited(root):
+    if path is None or evaluated.lodgs.mode != "SELECTIVE" or is_edited(root):
         return None
     stream = settings.stream
     finest = max(item.number for item in settings.existing_levels)
