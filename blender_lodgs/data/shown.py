@@ -91,8 +91,7 @@ def splat_instances(
     levels = {
         item.object: (item.number, root)
         for root in roots.roots(depsgraph.scene)
-        for item in root.lodgs.levels
-        if item.object is not None
+        for item in root.lodgs.existing_levels
     }
     instances, own_looks = [], {}
     for instance in depsgraph.object_instances:  # visible ones only
@@ -110,7 +109,7 @@ def splat_instances(
             continue
         original = obj.original
         evaluated = original.evaluated_get(depsgraph)
-        level, root = levels.get(original) or (0, roots.root_of(original))
+        level, root = levels.get(original) or _instanced_level(original)
         antialias = root is not None and root.lodgs.antialias
         look_key = root, evaluated.matrix_world.copy().freeze()  # levels mostly share one look
         if root is not None and look_key not in own_looks:
@@ -119,6 +118,16 @@ def splat_instances(
         instances.append(SplatInstance(original, evaluated, matrix, level, antialias, looks=look))
     instances.sort(key=lambda instance: (instance.level, instance.object.name))
     return _with_sources(instances, depsgraph)
+
+
+def _instanced_level(obj: bpy.types.Object) -> tuple[int, bpy.types.Object | None]:
+    """Return the level number and the root of splats outside the scenes of :func:`roots.roots`.
+
+    The number is 0 for splats that are not a level, and the root None for splats in no splat scene.
+    """
+    root = roots.root_of(obj)
+    items = root.lodgs.levels if root is not None else ()
+    return next((item.number for item in items if item.object == obj), 0), root
 
 
 def _drawable(matrix: np.ndarray) -> np.ndarray | None:

@@ -444,8 +444,8 @@ def render_border(render: bpy.types.RenderSettings, width: int, height: int) -> 
 
 
 def level_numbers(scene: bpy.types.Scene) -> list[int]:
-    """Return the sorted level numbers of all splat scenes in a Blender scene."""
-    return sorted({item.number for root in roots.roots(scene) for item in root.lodgs.levels})
+    """Return the sorted level numbers of all splat scenes in a Blender scene, also in instances."""
+    return sorted({item.number for root in roots.all_roots(scene) for item in root.lodgs.levels})
 
 
 def use(scene: bpy.types.Scene) -> None:

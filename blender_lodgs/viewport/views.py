@@ -362,12 +362,16 @@ def _placements(
     update: bool,
 ) -> tuple[Placement, ...]:
     """Return the rows of each instance in ``source``, with its transform and query."""
-    root_of_level = {item.object: root for root in roots.roots(depsgraph.scene) for item in root.lodgs.levels}
+    root_of_level = {
+        item.object: root for root in roots.roots(depsgraph.scene) for item in root.lodgs.existing_levels
+    }
     numbers = {key: number for number, key in enumerate(_versions)}
     placements = []
     for instance in instances:
         number = numbers[_key(instance, depsgraph)]
         root = root_of_level.get(instance.object)
+        if root is None and instance.level:  # in an instance of another file's scene
+            root = roots.root_of(instance.object)
         paged = instance.source and _streams[instance.source.scene]
         placements.append(
             Placement(

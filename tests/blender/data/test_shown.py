@@ -118,6 +118,21 @@ def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels
     assert visible_sets(bpy, lodgs) == []
 
 
+def test_instances_of_linked_scenes_have_level_numbers(bpy, lodgs, two_levels, tmp_path):
+    root, _ = two_levels
+    root.lodgs.mode, name = "SELECTIVE", root.users_collection[0].name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "scene.blend"), link=True) as (_, linked):
+        linked.collections = [name]
+    carrier = bpy.data.objects.new("carrier", None)
+    carrier.instance_type, carrier.instance_collection = "COLLECTION", linked.collections[0]
+    bpy.context.scene.collection.objects.link(carrier)
+    instances = lodgs("data.shown").splat_instances(bpy.context.evaluated_depsgraph_get())
+    assert [instance.level for instance in instances] == [1, 2]
+    assert lodgs("render.engine").level_numbers(bpy.context.scene) == [1, 2]
+
+
 def test_instances_of_the_splats_show_no_cameras(bpy, lodgs, two_levels):
     root, _ = two_levels
     importing = lodgs("data.importing")
