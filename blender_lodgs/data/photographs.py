@@ -18,7 +18,7 @@ from ...training.splats.dialects import Warn, ignore
 from ..attributes import HIDDEN, read_attribute
 from . import crops, metadata
 from .objects import root_of
-from .placement import matrix_in_world
+from .placement import axes_of, matrix_in_world
 
 SENSOR = 36.0
 """Longer side of imported cameras' sensors in millimetres, as on a full-frame camera."""
@@ -125,10 +125,14 @@ def camera_of(view: bpy.types.Object) -> Camera:
 
 
 def views(root: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the existing camera objects of a scene, sorted by name."""
-    cameras = root.lodgs.cameras
-    objects = [obj for obj in cameras.objects if obj.type == "CAMERA"] if cameras else []
-    return sorted(objects, key=lambda obj: obj.name)
+    """Return the existing camera objects of a scene, sorted by name.
+
+    Its collection also has those of copies of the scene.
+    """
+    objects, axes = root.lodgs.cameras.objects if root.lodgs.cameras else (), axes_of(root)
+    cameras = [obj for obj in objects if obj.type == "CAMERA"]
+    own = [obj for obj in cameras if obj.parent == axes or root_of(obj) in (None, root)]
+    return sorted(own, key=lambda obj: obj.name)
 
 
 def views_with_photo(root: bpy.types.Object) -> list[bpy.types.Object]:

@@ -117,3 +117,13 @@ def test_opacities_for_other_programs_contain_the_2d_filter(bpy, root, tmp_path,
         assert not filtered
         np.testing.assert_allclose(opacities, expected.opacity_logits, atol=2e-3)
     assert (expected.opacity_logits < trained.opacity_logits - 0.1).all()
+
+
+def test_copies_of_a_scene_have_their_own_views(bpy, lodgs, root):
+    for obj in bpy.context.view_layer.objects:
+        obj.select_set(True)
+    bpy.context.view_layer.objects.active = root
+    bpy.ops.object.duplicate()
+    copy = bpy.context.active_object
+    own_views = [lodgs("data.photographs").views(scene) for scene in (root, copy)]
+    assert [len(group) for group in own_views] == [6, 6] and not set(own_views[0]) & set(own_views[1])
