@@ -206,7 +206,8 @@ def points_material() -> bpy.types.Material:
 
 def _set_material(cloud: bpy.types.PointCloud, is_native: bool) -> None:
     """Add the points material to a cloud, or remove it if Blender draws splats; other materials stay."""
-    own = [material.name if material else "" for material in cloud.materials] == [_POINTS]
+    names = [material.name if material else "" for material in cloud.materials]
+    own = [name.partition(".")[0] for name in names] == [_POINTS]  # appended ones have a number
     if is_native and own:
         cloud.materials.clear()
     elif not is_native and not cloud.materials:

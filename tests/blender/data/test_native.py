@@ -232,6 +232,15 @@ def test_cycles_draws_a_level_like_blenders_own_import(bpy, lodgs, make, with_sp
     np.testing.assert_array_equal(lodgs_image, blender_image)
 
 
+def test_appended_points_material_does_not_replace_colours(lodgs, make, native, with_splats):
+    """Blender numbers the material of an older file if this file has one."""
+    display, obj = lodgs("nodes.display"), native(make())
+    obj.data.materials.append(display.points_material().copy())
+    assert obj.data.materials[0].name == "LODGS Points.001"
+    display.attach(obj)
+    assert not obj.data.materials
+
+
 def test_blender_and_lodgs_draw_the_same_selection(bpy, lodgs, make, with_splats, tmp_path):
     bundles = lodgs("training.splats.bundle")
     levels_module = lodgs("training.splats.levels")
