@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import bpy
 
@@ -121,6 +121,12 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
     else:
         modifier[identifier] = value
     modifier.id_data.update_tag()
+
+
+def use_standard_view(settings: bpy.types.ColorManagedViewSettings) -> None:
+    """Set the view transform that keeps display colours, if Blender's colour configuration has it."""
+    with suppress(TypeError):  # a studio's own configuration
+        settings.view_transform = "Standard"
 
 
 def sequencer_strips(scene: bpy.types.Scene):

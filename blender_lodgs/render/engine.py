@@ -27,7 +27,7 @@ from ...training.lod.rule import all_rule_columns
 from ...training.render.lens import LensProjection
 from ...training.scenes.cameras import Camera, camera_to_dict
 from ...training.splats.gaussians import Splats
-from .. import attributes
+from .. import attributes, compat
 from ..data import changes, objects, roots, selection, shown
 from ..data.cameras import RenderView, aperture_of, require_flat_stereo, scene_camera, unsupported_lens
 from ..data.paths import absolute_path
@@ -451,7 +451,7 @@ def level_numbers(scene: bpy.types.Scene) -> list[int]:
 def use(scene: bpy.types.Scene) -> None:
     """Set the LODGS engine and a view transform that shows colours as in the photos."""
     scene.render.engine = ID
-    scene.view_settings.view_transform = "Standard"
+    compat.use_standard_view(scene.view_settings)
     scene.view_settings.look = "None"
 
 

@@ -112,7 +112,7 @@ def _open_video(video: Path) -> Iterator[tuple[bpy.types.Scene, int]]:
         render = scene.render
         render.resolution_x, render.resolution_y = element.orig_width, element.orig_height
         render.resolution_percentage = 100
-        scene.view_settings.view_transform = "Standard"
+        compat.use_standard_view(scene.view_settings)
         compat.set_png(render.image_settings, alpha=False)
         yield scene, strip.frame_duration
     finally:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -508,6 +509,19 @@ def test_other_objects_as_camera_are_rejected(bpy, lodgs, scene, monkeypatch):
     for render in (bpy.ops.render.render, bpy.ops.lodgs.render_quick):
         with pytest.raises(RuntimeError, match="the scene's camera 'empty' is not a camera"):
             render()
+
+
+def test_other_colour_configurations_keep_their_view_transform(lodgs):
+    class Settings:
+        look = view_transform = "ACES"
+
+        def __setattr__(self, name, value):
+            if (name, value) == ("view_transform", "Standard"):
+                raise TypeError("enum not found")
+
+    scene = SimpleNamespace(render=SimpleNamespace(), view_settings=Settings())
+    lodgs("render.engine").use(scene)
+    assert scene.render.engine == "LODGS"
 
 
 def test_unsupported_lenses_are_rejected(bpy, scene):
