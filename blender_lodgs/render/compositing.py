@@ -56,8 +56,9 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         The scene that renders the meshes.
 
     Raises:
-        LodgsError: the scene has no splats, or it has compositor nodes of the user.
+        LodgsError: the scene has no splats, or it has compositor nodes of the user; or Cycles is disabled.
     """
+    require_cycles(scene)
     if not roots.shows_splats(scene):
         raise LodgsError(
             f"Cannot combine with meshes: the scene '{scene.name}' has no splats.",
@@ -95,6 +96,15 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
     if is_new or (_is_ours(tree) and built != needed):
         _build_nodes(tree, *needed, scene, meshes)
     return meshes
+
+
+def require_cycles(scene: bpy.types.Scene) -> None:
+    """Raise LodgsError if Blender has no Cycles, which is an add-on that users can disable."""
+    if not hasattr(scene, "cycles"):
+        raise LodgsError(
+            "Cannot render meshes: Cycles is disabled.",
+            "Enable the add-on Cycles Render Engine in Blender's preferences.",
+        )
 
 
 def separate_meshes(scene: bpy.types.Scene) -> None:

@@ -32,9 +32,11 @@ def render_mesh_depth(scene: bpy.types.Scene, frames: Iterable[int]) -> Iterator
         The written file of each frame (:func:`depth_file_pattern`).
 
     Raises:
-        LodgsError: the scene has no camera, no meshes or several views, or a file cannot be written.
+        LodgsError: the scene has no camera, no meshes or several views, a file cannot be written, or Cycles
+            is disabled.
     """
     scene_camera(scene)
+    compositing.require_cycles(scene)
     if scene.render.use_multiview:
         raise LodgsError(
             "Cannot render mesh depth: the scene has a stereo or multi-view render.",

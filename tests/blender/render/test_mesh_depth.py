@@ -34,6 +34,21 @@ def test_meshes_below_the_root_of_splats_have_depth(bpy, lodgs):
     assert has_depth(mesh) and not has_depth(root)
 
 
+def test_disabled_cycles_is_reported(bpy, lodgs, tmp_path):
+    write_bundle(tmp_path / "splats.ply", Bundle("", [Level(1, splats(10))]))
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "splats.ply")
+    scene = bpy.context.scene
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(scene.camera)
+    assert bpy.ops.preferences.addon_disable(module="cycles") == {"FINISHED"}
+    try:
+        for operator in ("combine_with_meshes", "render_mesh_depth"):
+            with pytest.raises(RuntimeError, match="Cannot render meshes: Cycles is disabled"):
+                getattr(bpy.ops.lodgs, operator)()
+    finally:
+        assert bpy.ops.preferences.addon_enable(module="cycles") == {"FINISHED"}
+
+
 def test_scene_without_meshes_has_no_depth(bpy, lodgs, tmp_path):
     write_bundle(tmp_path / "splats.ply", Bundle("", [Level(1, splats(10))]))
     lodgs("data.importing").import_splats(bpy.context, tmp_path / "splats.ply")
