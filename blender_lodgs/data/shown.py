@@ -184,7 +184,7 @@ def at_instance(query: selection.LodQuery, instance: SplatInstance) -> selection
 
     A camera that is fixed to the splats, such as the mean of the training cameras, stays there.
     """
-    root = roots.root_of(instance.object)
+    root = roots.root_of(instance.evaluated)  # with animated settings
     own = np.array(instance.evaluated.matrix_world, np.float64)
     is_fixed = root is not None and not root.lodgs.freeze and root.lodgs.camera_choice == "TRAINING"
     if not query.rule or is_fixed or np.array_equal(own, instance.matrix_world):

@@ -118,6 +118,34 @@ def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels
     assert visible_sets(bpy, lodgs) == []
 
 
+def test_instances_follow_the_animated_choice_of_the_camera(bpy, lodgs, two_levels, tmp_path):
+    """The training cameras are fixed to the splats of each instance; other cameras stay in the world."""
+    (root, _), scene = two_levels, bpy.context.scene
+    shown, engine = lodgs("data.shown"), lodgs("render.engine")
+    carrier = bpy.data.objects.new("carrier", None)
+    carrier.instance_type, carrier.instance_collection = "COLLECTION", root.users_collection[0]
+    carrier.location = (10, 0, 0)
+    scene.collection.objects.link(carrier)
+    root.lodgs.mode = "SELECTIVE"
+    for frame, choice in ((1, "TRAINING"), (2, "CAMERA")):
+        root.lodgs.camera_choice = choice
+        root.lodgs.keyframe_insert("camera_choice", frame=frame)
+    engine.use(scene)
+    scene.frame_start, scene.frame_end = 1, 2
+    scene.frame_set(2)
+    scene.render.filepath = str(tmp_path / "frame_")
+    scene.render.resolution_x = scene.render.resolution_y = 8
+    counts = {}
+
+    def render_frame(depsgraph, *_):
+        queries = [shown.rule_query(item, depsgraph) for item in shown.splat_instances(depsgraph)]
+        counts[depsgraph.scene.frame_current] = len({query.position for query in queries})
+
+    with engine.use_renderer(render_frame):
+        bpy.ops.render.render(animation=True)
+    assert counts == {1: 1, 2: 2}
+
+
 def test_instances_of_linked_scenes_have_level_numbers(bpy, lodgs, two_levels, tmp_path):
     root, _ = two_levels
     root.lodgs.mode, name = "SELECTIVE", root.users_collection[0].name

@@ -211,7 +211,7 @@ def test_edited_scenes_are_not_streamed(bpy, lodgs, root):
     assert streams.source_of(root) is None
 
 
-def test_renders_stream_in_frames_whose_mode_is_by_distance(bpy, lodgs, root):
+def test_renders_stream_in_frames_whose_mode_is_by_distance(bpy, lodgs, root, tmp_path):
     """Blender evaluates keyframes for a render in copies of the objects."""
     scene, engine = bpy.context.scene, lodgs("render.engine")
     engine.use(scene)
@@ -222,6 +222,7 @@ def test_renders_stream_in_frames_whose_mode_is_by_distance(bpy, lodgs, root):
         root.lodgs.keyframe_insert("mode", frame=frame)
     scene.frame_start, scene.frame_end = 1, 2
     scene.frame_set(2)
+    scene.render.filepath = str(tmp_path / "frame_")
     scene.render.resolution_x = scene.render.resolution_y = 8
     is_streamed = {}
 
