@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Protocol, cast
 
 import bpy
@@ -31,6 +32,10 @@ class PreferenceValues(Protocol):
     notices: bool
 
 
+_DEFAULTS = SimpleNamespace(python="", backend="auto", flamenco="", notices=False)
+"""Preferences without stored values, as of a Blender that was started with ``--addons``."""
+
+
 def user_folder(name: str = "") -> Path:
     """Return the extension's writable folder in Blender's user folder, or a subfolder of it."""
     return Path(bpy.utils.extension_path_user(ID, path=name))
@@ -38,7 +43,8 @@ def user_folder(name: str = "") -> Path:
 
 def preferences() -> PreferenceValues:
     """Return the extension's preferences."""
-    return cast(PreferenceValues, bpy.context.preferences.addons[ID].preferences)
+    addon = bpy.context.preferences.addons.get(ID)
+    return cast(PreferenceValues, _DEFAULTS if addon is None else addon.preferences)
 
 
 def in_window():

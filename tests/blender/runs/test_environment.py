@@ -123,3 +123,18 @@ def test_blender_variables_are_removed_from_the_trainers_environment(lodgs, monk
     values = lodgs("runs.processes").environment()
     assert "PYTHONPATH" not in values and "PYTHONHOME" not in values and values["KEPT"] == "1"
     assert "lodgs" in values["PYTHONPYCACHEPREFIX"]
+
+
+def test_preferences_have_defaults_without_stored_values(bpy, lodgs):
+    """Blender stores none for extensions that the command line enables with --addons."""
+    extension, addons = lodgs("extension"), bpy.context.preferences.addons
+
+    def values() -> list:
+        return [getattr(extension.preferences(), name) for name in extension.PreferenceValues.__annotations__]
+
+    stored = values()
+    addons.remove(addons[extension.ID])
+    try:
+        assert values() == stored
+    finally:
+        addons.new().module = extension.ID
