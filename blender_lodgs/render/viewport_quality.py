@@ -76,7 +76,7 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
         LodgsError: see :func:`render`, or a file cannot be written.
     """
     scene = context.scene
-    current_frame = scene.frame_current
+    current_frame, subframe = scene.frame_current, scene.frame_subframe
     if scene.render.is_movie_format:
         raise LodgsError(
             "Cannot render in viewport quality: the output is a video.",
@@ -99,7 +99,7 @@ def render_animation(context: bpy.types.Context, frames: Iterable[int]) -> Itera
             require_complete_image(Path(path))
             yield Path(path)
     finally:
-        scene.frame_set(current_frame)
+        scene.frame_set(current_frame, subframe=subframe)
 
 
 @contextmanager

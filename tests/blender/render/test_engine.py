@@ -906,6 +906,12 @@ def test_viewport_quality_ignores_the_clip_end(bpy, scene, frame, tmp_path):
     assert is_similar(render_quick(bpy, tmp_path / "quick.png"), image)
 
 
+def test_viewport_quality_restores_the_frame(bpy, lodgs, scene):
+    scene.frame_set(3, subframe=0.5)
+    list(lodgs("render.viewport_quality").render_animation(bpy.context, []))
+    assert (scene.frame_current, scene.frame_subframe) == (3, 0.5)
+
+
 def test_viewport_quality_rejects_holdout(bpy, scene, frame, tmp_path):
     scene.lodgs_render.holdout = str(tmp_path / "depth_####.exr")
     with pytest.raises(RuntimeError, match=r"Hold Out is set.*\s+Clear Hold Out"):
