@@ -60,9 +60,17 @@ def add_crop(
     obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half), keep)
     for selected in context.selected_objects:
         selected.select_set(False)
-    obj.select_set(True)
-    context.view_layer.objects.active = obj
+    if _make_active(context, obj):
+        obj.select_set(True)
     return obj
+
+
+def _make_active(context: bpy.types.Context, obj: bpy.types.Object) -> bool:
+    """Make an object active. Return False if the view layer excludes its collection."""
+    is_included = context.view_layer.objects.get(obj.name) == obj
+    if is_included:
+        context.view_layer.objects.active = obj
+    return is_included
 
 
 class LODGS_OT_add_region(SceneOperator, bpy.types.Operator):
@@ -96,7 +104,7 @@ class LODGS_OT_remove_crop(EditLevelsOperator, bpy.types.Operator):
                 active = context.active_object == crop
                 bpy.data.objects.remove(crop)
                 if active:
-                    context.view_layer.objects.active = root
+                    _make_active(context, root)
                 return {"FINISHED"}
         raise LodgsError(
             f"Cannot remove crop: '{root.name}' has no crop '{self.name}'.",
@@ -188,7 +196,7 @@ class LODGS_OT_delete_hidden_splats(EditLevelsOperator, bpy.types.Operator):
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         if context.active_object in crops.crops_of(root):
-            context.view_layer.objects.active = root
+            _make_active(context, root)
         self.report({"INFO"}, f"{scenes.delete_excluded(root):,} splats deleted")
         return {"FINISHED"}
 

@@ -172,3 +172,13 @@ def test_levels_without_splats_are_reported(bpy, lodgs, root, operator):
     root.lodgs.levels[-1].object.data = cloud
     with pytest.raises(RuntimeError, match=r"^Error: Cannot (measure|find clutter)"):
         getattr(bpy.ops.lodgs, operator)()
+
+
+def test_crops_of_scenes_that_the_view_layer_excludes(bpy, lodgs, root):
+    collections = bpy.context.view_layer.layer_collection.children
+    collections[root.users_collection[0].name].exclude = True
+    assert bpy.ops.lodgs.add_crop() == {"FINISHED"}
+    [crop] = lodgs("data.crops").crops_of(root)
+    bpy.context.scene.collection.objects.link(crop)
+    bpy.context.view_layer.objects.active = crop
+    assert bpy.ops.lodgs.delete_hidden_splats() == {"FINISHED"}
