@@ -185,6 +185,12 @@ class DensityParameters(Parameters):
     full_resolution: float = setting(
         0.5, "Fraction of the steps after which training images have full size.", high=1
     )
+    far_share: float = setting(
+        0.25,
+        "Fraction of the steps with full-size images that reduce their image by 2 or 4 instead, as if seen "
+        "from farther away. Improves small images.",
+        high=1,
+    )
     long_axis: bool = setting(
         True,
         "Densify by splitting splats in two along their longest axis, which changes the image little. "
@@ -268,6 +274,7 @@ AS_PUBLISHED: dict[str, Any] = {
 """Values of presets *paper* that disable additions to the papers. Only LODGE uses the filter."""
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
+    "far_share": 0.0,
     "long_axis": False,
     "opacity_reset_interval": 3000,
     "grad_threshold": 2e-4,

@@ -10,9 +10,11 @@ from math import ceil, inf, sqrt
 
 import numpy as np
 
-SMALL_IMAGES, SMALL_SHARE = (2, 4), 0.25
-"""Reductions of images while a merged level is refined, and the share of steps with one of them. On full-size
-images alone, a level becomes worse than its merge at small sizes."""
+SMALL_IMAGES = 2, 4
+"""Reductions of images, as if they were seen from farther away."""
+SMALL_SHARE = 0.25
+"""Share of the steps that refine a merged level with reduced images. On full-size images alone, a level
+becomes worse than its merge at small sizes."""
 
 
 def log_linear(first: float, last: float, share: float) -> float:
@@ -88,10 +90,14 @@ class ShSchedule:
 
 
 @lru_cache(1 << 13)  # image reading asks for coming steps, too
-def random_reduction(seed: int, step: int) -> float:
-    """Draw the factor by which the image of a step that refines a merged level is reduced, mostly 1."""
+def random_reduction(seed: int, step: int, share: float = SMALL_SHARE) -> float:
+    """Draw the factor by which the image of a step is reduced: 1, or one of SMALL_IMAGES.
+
+    Args:
+        share: share of the steps with a reduced image.
+    """
     rng = np.random.default_rng([seed, step, 21])
-    return float(rng.choice(SMALL_IMAGES)) if rng.random() < SMALL_SHARE else 1.0
+    return float(rng.choice(SMALL_IMAGES)) if rng.random() < share else 1.0
 
 
 def refining_reduction(seed: int, step: int, share: float, first: float, full: float) -> float:

@@ -24,7 +24,7 @@ from .initialize import drop_duplicates, from_points, from_splats, sample_points
 from .method import Drawing, Method
 from .model import Model, splat_rates
 from .parameters import SplatParameters
-from .schedules import due, log_linear, shrink_at
+from .schedules import due, log_linear, random_reduction, shrink_at
 from .training_data import TrainingView
 
 PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
@@ -65,7 +65,8 @@ class SplatMethod(Method[SplatParameters, Drawing]):
 
     def shrink(self, step: int) -> float:
         p = self.parameters
-        return shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
+        factor = shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
+        return factor if factor > 1 else random_reduction(self.seed, step, p.far_share)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         return self.dropout.weights(len(self.model), step, step / self.scheduled_steps), 0.0

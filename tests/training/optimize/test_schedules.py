@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -28,12 +29,28 @@ def test_pixel_count_grows_linearly():
 
 @pytest.mark.parametrize("name", ["3dgs", "flod", "clod"])
 def test_first_steps_use_reduced_images_and_last_steps_full_ones(data, name):
-    parameters = replace(METHODS[name].presets["draft"], first_resolution=0.5, full_resolution=0.5)
+    parameters = replace(
+        METHODS[name].presets["draft"], first_resolution=0.5, full_resolution=0.5, far_share=0.0
+    )
     method = create(name, data, parameters, 0, "cpu")
     first, last = method.choose_view(0), method.choose_view(method.steps - 1)
     assert first.shrink == 2 and first.camera.width == data.train[0].width // 2
     assert tuple(first.target.image.shape[:2]) == (first.camera.height, first.camera.width)
     assert last.shrink == 1 and last.camera is data.train[last.index]
+
+
+@pytest.mark.parametrize("name", ["3dgs", "flod", "matryoshka"])
+def test_some_steps_see_the_scene_from_farther_away(data, name):
+    """A quarter of the steps after half of the 3DGS steps have half or a quarter of the size."""
+    parameters = replace(METHODS[name].presets["draft"], full_resolution=0.5, far_share=0.25)
+    method = create(name, data, parameters, 0, "cpu")
+    steps = method.stages.ends[0] if name == "flod" else method.steps
+    factors = [method.shrink(step) for step in range(steps // 2 + 1, steps)]
+    assert set(factors) == {1, 2, 4}
+    assert np.mean(np.array(factors) > 1) == pytest.approx(0.25, abs=0.05)
+    view = method.choose_view(steps // 2 + 1 + factors.index(4))
+    assert view.camera.width == data.train[0].width // 4
+    assert view.target.image.shape[1] == view.camera.width
 
 
 def test_gradients_of_reduced_images_are_scaled_down(data):

@@ -32,7 +32,7 @@ from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.refining import refining_rates
-from ...optimize.schedules import LevelStages, due, log_linear, shrink_at
+from ...optimize.schedules import LevelStages, due, log_linear, random_reduction, shrink_at
 from ...optimize.training_data import TrainingView
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
@@ -131,7 +131,10 @@ class Method(method.Method[FlodParameters, Drawing]):
             progress = self.stages.share(step)
         else:
             progress = self._progress(step)
-        return shrink_at(progress, p.first_resolution, p.full_resolution)
+        factor = shrink_at(progress, p.first_resolution, p.full_resolution)
+        if factor > 1 or self.is_finishing(step):
+            return factor
+        return random_reduction(self.seed, self._skipped_steps + step, p.far_share)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         if self.is_finishing(step):

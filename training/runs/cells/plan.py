@@ -41,7 +41,8 @@ SEAM_METHOD = "3dgs"
 SEAM_PARAMETERS = {
     "lr_means": 0.0, "lr_means_final": 0.0, "lr_quats": 0.0, "lr_scales": 0.0, "lr_opacities": 1e-2,
     "lr_sh": 1e-3, "densify_until": 0.0, "prune_interval": 0, "opacity_reset_interval": 0,
-    "least_weight": 0.0, "first_resolution": 1.0, "free_depth": 0.0, "largest": 0.0, "margin": 0.0,
+    "least_weight": 0.0, "first_resolution": 1.0, "far_share": 0.0, "free_depth": 0.0, "largest": 0.0,
+    "margin": 0.0,
 }  # fmt: skip
 """Parameters that fit only colours and opacities: splats are not moved, resized, added or removed, so that
 each stays in its cell and keeps the size of its level."""

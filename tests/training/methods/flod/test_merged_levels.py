@@ -83,7 +83,9 @@ def test_finest_level_has_full_images_after_its_own_share(data):
     """The schedule of the finest level counts its own steps, not those of the run, so that it densifies on
     almost full-size images.
     """
-    flod = make(data, steps=[400] * 3, refine_steps=300, first_resolution=0.5, full_resolution=0.5)
+    flod = make(
+        data, steps=[400] * 3, refine_steps=300, first_resolution=0.5, full_resolution=0.5, far_share=0.0
+    )
     end = flod.stages.ends[0]
     factors = [flod.shrink(step) for step in range(end)]
     assert factors[0] > 1.4

@@ -54,9 +54,8 @@ def same(first: Splats, second: Splats) -> bool:
 
 @pytest.fixture(scope="module")
 def base(data) -> Splats:
-    plain = create(
-        "3dgs", data, override(method_info("3dgs").preset("draft"), {"steps": 12, "margin": 0.0}), 0, "cpu"
-    )
+    values = {"steps": 12, "margin": 0.0, "far_share": 0.0}
+    plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     return trained(plain)[-1].splats
 
 
