@@ -223,6 +223,7 @@ def _parse_images_bin(data: mmap.mmap) -> list[Pose]:
     offset = 8
     poses = []
     for _ in range(count):
+        _require_size(data)
         _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
         end = _name_end(data, offset + 64)
         name = data[offset + 64 : end]
@@ -292,6 +293,7 @@ def _parse_observations_bin(data: mmap.mmap, names: Collection[str]) -> dict[str
     offset = 8
     observations = {}
     for _ in range(count):
+        _require_size(data)
         end = _name_end(data, offset + 64)
         (points2d,) = struct.unpack_from("<Q", data, end + 1)
         if (name := _decode_name(data[offset + 64 : end])) in names:
@@ -321,10 +323,17 @@ def _with_points(records: np.ndarray) -> np.ndarray:
 
 def _record_count(data: mmap.mmap, min_bytes: int) -> int:
     """Return the declared number of records, of at least the given bytes each."""
+    _require_size(data)
     (count,) = struct.unpack_from("<Q", data)
     if 8 + count * min_bytes > len(data):
         raise ValueError(f"it is too short for {count} records")
     return count
+
+
+def _require_size(data: mmap.mmap) -> None:
+    """Raise ValueError if a mapped file has become shorter: the system ends processes that read there."""
+    if data.size() < len(data):
+        raise ValueError("another program has truncated it")
 
 
 def _name_end(data: mmap.mmap, begin: int) -> int:
@@ -384,21 +393,27 @@ _NUMERIC = b"0123456789.+-eEnaifNAIF"  # characters of numbers, including nan an
 def _parse_points_bin(data: mmap.mmap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     count = _record_count(data, POINT.itemsize)
     body = np.frombuffer(data, np.uint8, offset=8)
-    starts = _point_starts(body, count)
+    starts = _point_starts(body, count, lambda: _require_size(data))
     if len(starts) != count:
         raise ValueError(f"it has {len(starts)} points instead of {count}")
     if not count:
         return _NO_POINTS
+    _require_size(data)
     records = np.lib.stride_tricks.sliding_window_view(body, POINT.itemsize)[starts].view(POINT)[:, 0]
     return records["xyz"].astype(np.float64), records["rgb"].copy(), records["id"].astype(np.int64)
 
 
-def _point_starts(body: np.ndarray, expected: int) -> np.ndarray:
-    """Return the offsets of the records of points3D.bin, computed block by block; stop after too many."""
+def _point_starts(body: np.ndarray, expected: int, check: Callable[[], object] = lambda: None) -> np.ndarray:
+    """Return the offsets of the records of points3D.bin, computed block by block; stop after too many.
+
+    Args:
+        check: called before a block is read.
+    """
     offsets = [np.zeros(0, np.int64)]
     offset = 0
     count = 0
     while offset < len(body) and count <= expected:
+        check()
         starts, end = _record_chain(body[offset : offset + _BLOCK])
         count += len(starts)
         if not len(starts) or offset + end > len(body):

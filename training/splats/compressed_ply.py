@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import LodgsError
 from .dialects import comments_from_meta, meta_from_comments
 from .gaussians import SH_C0, SplatRows, Splats
-from .mapped_rows import release_pages
+from .mapped_rows import release_pages, require_size
 from .morton import spatial_order
 from .ply import Element, read_elements, write_elements
 from .portable_levels import batches, splats_from_activated
@@ -119,6 +119,7 @@ class CompressedRows:
     """
 
     def __init__(self, path: Path, elements: dict[str, np.ndarray]) -> None:
+        self._path = path
         empty = np.empty(0, [])
         self._chunks, self._words, self._rest = (
             elements.get(name, empty) for name in ("chunk", "vertex", "sh")
@@ -148,7 +149,13 @@ class CompressedRows:
         return len(self._words)
 
     def select(self, index: slice | np.ndarray, /) -> Splats:
-        """Return the splats of a range of rows, or of ascending rows (M,)."""
+        """Return the splats of a range of rows, or of ascending rows (M,).
+
+        Raises:
+            LodgsError: another program has truncated the file.
+        """
+        for elements in (self._chunks, self._words, self._rest):
+            require_size(elements, self._path)
         numbers = np.arange(*index.indices(len(self))) if isinstance(index, slice) else index
         chunks = self._chunks[numbers // _CHUNK]
         rows = self._words[index]

@@ -20,6 +20,7 @@ import numpy as np
 from ..color import srgb_from_linear
 from ..documents import open_file, parse_json
 from ..errors import LodgsError, printable
+from .batches import batch_slices
 from .bundle import write_bundle
 from .gaussians import SH_C0, Splats
 from .gltf import (
@@ -36,6 +37,7 @@ from .gltf import (
     harmonics,
 )
 from .levels import MAX_READ_LEVELS, Bundle, Level
+from .mapped_rows import require_size
 from .portable_levels import join_levels, parse_description, place_splats, splats_from_activated, upright_meta
 from .quats import rotation_matrices
 from .spz import unpack_spz
@@ -52,6 +54,8 @@ _SPZ_SPLAT = 19
 """Minimum bytes of a splat of SPZ before compression."""
 _MAX_RATIO = 20
 """Maximum ratio of compression that is read; that of trained splats is about 2."""
+_BLOCK = 1 << 16
+"""Values of an accessor that are copied at a time."""
 _INSTANCING = "EXT_mesh_gpu_instancing"
 _MEMORY, _RATIO = 1 << 27, 64
 """Bytes of splats in instances that a file of any size may have, and further bytes per byte of its size."""
@@ -269,6 +273,7 @@ class _GlbReader:
 
     def _compressed(self, index: object) -> Splats:
         data, _ = self._view(index)
+        require_size(data, self._path)
         splats, meta = unpack_spz(data.tobytes(), len(data) * _MAX_RATIO // _SPZ_SPLAT, self._path)
         self._meta |= meta
         self._splats += len(splats)
@@ -320,7 +325,10 @@ class _GlbReader:
         if not count:
             return np.zeros((0, width), np.float32)
         raw = np.ndarray((count, width), kind, data, begin, (stride, kind.itemsize))
-        values = raw.astype(np.float32)
+        values = np.empty((count, width), np.float32)
+        for block in batch_slices(count, _BLOCK):
+            require_size(data, self._path)
+            values[block] = raw[block]
         if accessor.get("normalized") and kind.kind != "f":
             values = np.maximum(values / np.iinfo(kind).max, -1)
         return values

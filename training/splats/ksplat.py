@@ -16,7 +16,7 @@ import numpy as np
 from ..documents import open_file
 from ..errors import LodgsError
 from .gaussians import SH_C0, Splats
-from .mapped_rows import release_pages
+from .mapped_rows import release_pages, require_size
 
 _HEADER = np.dtype({
     "names": ["version", "max_sections", "sections", "count", "compression", "sh_range"],
@@ -50,6 +50,7 @@ class KsplatRows:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         with open_file(path) as file:
             try:
                 self._read(file, os.fstat(file.fileno()).st_size)
@@ -90,7 +91,13 @@ class KsplatRows:
         return int(self._begins[-1])
 
     def select(self, index: slice | np.ndarray, /) -> Splats:
-        """Return the splats of a range of rows, or of ascending rows (M,)."""
+        """Return the splats of a range of rows, or of ascending rows (M,).
+
+        Raises:
+            LodgsError: another program has truncated the file.
+        """
+        for section in self._sections:
+            require_size(section.rows, self._path)
         rows = np.arange(len(self))[index]
         cuts = np.searchsorted(rows, self._begins)
         parts = [

@@ -3,6 +3,8 @@
 import os
 import shutil
 import struct
+import subprocess
+import sys
 import unicodedata
 from pathlib import Path
 
@@ -15,7 +17,9 @@ from training.errors import LodgsError
 from training.scenes import colmap
 from training.scenes import colmap_model as model_files
 from training.scenes.colmap import exclude_views, find_models, read_scene
+from training.scenes.lenses import make_intrinsics
 from training.scenes.undistort import undistort_scene
+from training.scenes.write_colmap import write_model
 
 SCENES = ("fox", "saharov", "caliterra")
 VARIANTS = (
@@ -415,3 +419,36 @@ def test_reading_loads_no_trainer_library():
     )
     root = Path(__file__).parents[3]
     assert subprocess.check_output([sys.executable, "-c", code], cwd=root, text=True).strip() == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+@pytest.mark.parametrize(("file", "function"), [("images.bin", "_pose"), ("points3D.bin", "_record_chain")])
+def test_model_that_another_program_truncates_is_reported(tmp_path, file, function):
+    """A process of its own, because reading beyond the end of a mapped file ends it."""
+    model, lens = tmp_path / "model", make_intrinsics("PINHOLE", 40, 30, np.array([50.0, 50, 20, 15]))
+    poses = [(f"{number:06}.png", np.eye(4)) for number in range(100)]
+    write_model(model, [lens] * 100, poses, np.zeros((9000, 3)), np.zeros((9000, 3), np.uint8))
+    program = """
+import os, sys
+from pathlib import Path
+from training.errors import LodgsError
+from training.scenes import colmap_model
+
+model, file, name = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+function = getattr(colmap_model, name)
+
+def truncate(*arguments):
+    result = function(*arguments)
+    os.truncate(model / file, 100)
+    return result
+
+setattr(colmap_model, name, truncate)
+try:
+    colmap_model.read_poses(model)
+    colmap_model.read_points(model)
+except LodgsError as error:
+    print(error)
+"""
+    command = [sys.executable, "-c", program, model, file, function]
+    process = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True)
+    assert "another program has truncated it" in process.stdout, process

@@ -1,5 +1,8 @@
 """Compressed PLY against words that splat-transform 3.7.0 wrote, its rounding, and damaged files."""
 
+import os
+import sys
+
 import numpy as np
 import pytest
 
@@ -155,3 +158,12 @@ def test_complete_file_is_read(tmp_path):
     (tmp_path / "a.ply").write_bytes(GOOD)
     with open_as_ply(tmp_path / "a.ply") as ply:
         assert len(read_bundle(ply).levels[0].splats) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+def test_file_that_another_program_truncates_is_reported(tmp_path):
+    write_compressed_ply(tmp_path / "a.ply", random_splats(3000), {})
+    rows, _ = read_compressed_ply(tmp_path / "a.ply")
+    os.truncate(tmp_path / "a.ply", 5000)
+    with pytest.raises(LodgsError, match="another program has truncated it"):
+        rows.select(slice(2990, 3000))

@@ -1,5 +1,6 @@
 """Splat files of other programs, exchanged with splat-transform if it is installed."""
 
+import os
 import shutil
 import struct
 import subprocess
@@ -282,3 +283,12 @@ def test_recipe_adds_a_format_to_the_command_line(tmp_path):
     np.testing.assert_allclose(np.loadtxt(tmp_path / "out.xyz"), splats.means, rtol=1e-6)
     assert ".xyz" in run("--help").stdout
     assert ".xyz" in run("in.ply", "--plain", "out.abc").stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+def test_splat_file_that_another_program_truncates_is_reported(tmp_path):
+    write_splat(tmp_path / "a.splat", random_splats(3000), {})
+    rows = SplatFile(tmp_path / "a.splat")
+    os.truncate(tmp_path / "a.splat", 3200)
+    with pytest.raises(LodgsError, match="another program has truncated it"):
+        rows.select(slice(2990, 3000))

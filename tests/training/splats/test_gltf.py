@@ -2,7 +2,9 @@
 
 import base64
 import json
+import os
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -539,3 +541,17 @@ def test_transforms_beyond_the_largest_coordinate_are_refused(tmp_path):
         (tmp_path / "b.glb").write_bytes(assembled(document | {"nodes": nodes}, data))
         with pytest.raises(LodgsError, match=r"a transform has numbers above 1e\+12"):
             read(tmp_path / "b.glb")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+def test_file_that_another_program_truncates_is_reported(tmp_path, monkeypatch):
+    export_levels(tmp_path / "a.glb", flod())
+    view = gltf_reader._GlbReader._view
+
+    def view_of_truncated(reader, index):
+        os.truncate(tmp_path / "a.glb", 4096)
+        return view(reader, index)
+
+    monkeypatch.setattr(gltf_reader._GlbReader, "_view", view_of_truncated)
+    with pytest.raises(LodgsError, match="another program has truncated it"):
+        read(tmp_path / "a.glb")

@@ -1,6 +1,8 @@
 """``.ksplat`` files of GaussianSplats3D against the splats that it wrote, and damaged files."""
 
+import os
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -123,3 +125,12 @@ def test_damaged_files_raise_one_sentence(read, content, reason):
     with pytest.raises(LodgsError, match=reason) as error:
         read(content)
     assert str(error.value.what).count(". ") == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps mapped files")
+def test_file_that_another_program_truncates_is_reported(tmp_path):
+    (tmp_path / "a.ksplat").write_bytes(FILES[0])
+    rows = KsplatRows(tmp_path / "a.ksplat")
+    os.truncate(tmp_path / "a.ksplat", HEADER)
+    with pytest.raises(LodgsError, match="another program has truncated it"):
+        rows.select(slice(None))

@@ -12,7 +12,7 @@ from ...errors import LodgsError
 from ...files import atomic_write
 from ..batches import batch_slices
 from ..gaussians import SH_C0, SplatRows, Splats
-from ..mapped_rows import release_pages
+from ..mapped_rows import release_pages, require_size
 from ..ply import BATCH_ROWS
 from ..splat_format import SplatFormat
 
@@ -49,6 +49,7 @@ class SplatFile:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         with open_file(path) as file:
             size = os.fstat(file.fileno()).st_size
             if not size or size % _ROW.itemsize:
@@ -60,7 +61,12 @@ class SplatFile:
         return len(self._rows)
 
     def select(self, index: slice | np.ndarray, /) -> Splats:
-        """Return the splats of a range of rows, or of ascending rows (M,)."""
+        """Return the splats of a range of rows, or of ascending rows (M,).
+
+        Raises:
+            LodgsError: another program has truncated the file.
+        """
+        require_size(self._rows, self._path)
         rows = np.array(self._rows[index])
         release_pages(self._rows)
         rgba = rows["rgba"].astype(np.float32) / 255
