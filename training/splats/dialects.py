@@ -36,6 +36,7 @@ _ANCHOR_SCALES = ("scale_3", "scale_4", "scale_5")
 _TEMPORAL = {"trbf_center", "trbf_scale", "motion_0", "scale_t", "scale_t_0", "t_scale", "rot_r_0"}
 _MIP = "SplatRenderMode: mip"
 _ORIGIN = "lodgs origin "
+_Z_UP = "lodgs z up"
 _GEOREFERENCE = "lodgs georeference "
 
 
@@ -144,13 +145,15 @@ def _apply_filter_3d(
 
 
 def meta_from_comments(comments: Iterable[str]) -> dict:
-    """Return a bundle's meta for the render mode, local origin and georeference in the comments of a PLY.
+    """Return a bundle's meta for the render mode, z up, local origin and georeference in comments of a PLY.
 
     ``antialias`` is True for splats trained with Mip-Splatting's 2D filter (Brush, Postshot). The others are
     those of :func:`comments_from_meta`.
     """
     comments = list(comments)
     meta: dict = {"antialias": True} if _render_mode(comments) == "mip" else {}
+    if _Z_UP in comments:
+        meta["up_rotation"] = np.eye(3).tolist()
     for comment in comments:
         if comment.startswith(_ORIGIN):
             with suppress(ValueError):
@@ -165,8 +168,13 @@ def meta_from_comments(comments: Iterable[str]) -> dict:
 
 
 def comments_from_meta(meta: dict) -> list[str]:
-    """Return the comments about the render mode, local origin and georeference in a bundle's meta."""
+    """Return the comments about the render mode, z up, local origin and georeference in a bundle's meta.
+
+    Other up directions have no comment, because readers without it assume -y up.
+    """
     comments = [_MIP] if meta.get("antialias") else []
+    if np.array_equal(meta.get("up_rotation", ()), np.eye(3)):
+        comments.append(_Z_UP)
     if any(origin := meta.get("origin", ())):
         comments.append(_ORIGIN + " ".join(repr(float(number)) for number in origin))
     if "georeference" in meta:

@@ -17,6 +17,7 @@ from training.lod.tree.nodes import streaming_order
 from training.lod.tree.paging import TreeFile
 from training.lod.tree.shape import Tree
 from training.splats.bundle import open_bundle, read_bundle, write_bundle
+from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
 from training.splats.level_folder import read_folder, write_folder
 from training.splats.levels import Bundle, Level
@@ -236,3 +237,15 @@ def test_invalid_options_are_reported(tmp_path, capsys, options, words):
     write_bundle(tmp_path / "b.ply", choosable("bands"))
     assert main(["edit", str(tmp_path / "b.ply"), "--out", str(tmp_path / "o.ply"), *options]) == 2
     assert words in capsys.readouterr().err and not (tmp_path / "o.ply").exists()
+
+
+def test_upright_plain_files_stay_upright(tmp_path):
+    """A second time turns nothing, also in a compressed PLY."""
+    write_ply(tmp_path / "a.ply", surfaces(40))
+    files = [tmp_path / name for name in ("a.ply", "out.ply", "again.ply", "plain.compressed.ply")]
+    source, out, again, compressed = map(str, files)
+    assert main(["edit", source, "--out", out, "--plain", compressed, "--upright"]) == 0
+    assert main(["edit", out, "--out", again, "--upright"]) == 0
+    assert files[1].read_bytes() == files[2].read_bytes() and b"lodsplat" not in files[1].read_bytes()[:4000]
+    with open_as_ply(files[3]) as ply:
+        np.testing.assert_array_equal(read_bundle(ply).up_rotation, np.eye(3))
