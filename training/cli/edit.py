@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from ..editing.cleaning import LIMITS, Cleaning
 from ..editing.export import FileOptions
 from ..editing.look import LOOK_SETTINGS, Look
 from ..errors import LodgsError
-from ..lod.crop import Crop
+from ..lod.crop import Crop, CropUnion
 from ..settings import settings_of
 from ..splats.formats import FORMATS, LEVEL_FORMATS, READABLE
 from .options import SOURCE_HELP, add_placement, add_setting, placement_of, setting_values, warn
@@ -172,9 +171,9 @@ def _edit(options: argparse.Namespace, source: Path, outputs: Outputs, limits: d
     from ..splats.level_folder import read_origin
 
     crops, look, scene = _crops(options), _look(options), None
-    look_crops: Sequence[Crop | None] = [None]
+    limit = None
     if options.keep == "all":
-        look_crops, crops = crops or [None], []
+        limit, crops = CropUnion(tuple(crops)) if crops else None, []
     if options.scene is not None:
         scene = read_scene(options.scene, origin=read_origin(source))
         limits["cameras"] = tuple(scene.cameras)
@@ -195,7 +194,7 @@ def _edit(options: argparse.Namespace, source: Path, outputs: Outputs, limits: d
             source, outputs, cleaning, warn,
             placement=placement_of(options), upright=options.upright, ground=options.ground,
             points=None if scene is None else scene.points,
-            looks=[(crop, look) for crop in look_crops] if look else (),
+            looks=[(limit, look)] if look else (),
             options=file_options, measure=measure,
         )
     )  # fmt: skip

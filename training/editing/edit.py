@@ -25,7 +25,7 @@ from ..splats.streamed_levels import MeasureLeaf, write_streamed_levels
 from .bake_filter import bake_filter
 from .cleaning import NO_CLEANING, Cleaning, clean_bundle
 from .export import DEFAULT_OPTIONS, FileOptions, export_finest_level, export_levels, export_tiles
-from .look import Looks, apply_looks_to_levels
+from .look import LimitedLooks, apply_looks_to_levels
 from .placement import transform_bundle, upright_placement
 
 
@@ -60,7 +60,7 @@ def edit(
     cleaning: Cleaning = NO_CLEANING,
     warn: Warn = ignore,
     *,
-    looks: Looks = (),
+    looks: LimitedLooks = (),
     placement: Similarity | None = None,
     upright: bool = False,
     ground: bool = False,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..lod.crop import Crop
+from ..lod.crop import Crop, CropUnion
 from ..settings import check_value, setting, settings_of
 from ..splats.gaussians import SH_C0, SplatRows, Splats
 from ..splats.levels import Bundle
@@ -85,6 +85,8 @@ NEUTRAL = Look()
 
 Looks = Sequence[tuple[Crop | None, Look]]
 """Looks in the order of application, each with a crop that limits it; None means all splats."""
+LimitedLooks = Sequence[tuple[Crop | CropUnion | None, Look]]
+"""Looks as above, each limited by one crop or by several."""
 
 
 def looks_as_dicts(looks: Looks) -> list[dict[str, Any]]:
@@ -118,7 +120,7 @@ def _black_body(temperature: float) -> np.ndarray:
 
 
 def change_colors(
-    looks: Looks, means: np.ndarray, sh: np.ndarray, opacity_logits: np.ndarray
+    looks: LimitedLooks, means: np.ndarray, sh: np.ndarray, opacity_logits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Apply looks to harmonics (N, K, 3) and opacity logits (N,) of splats at means (N, 3).
 
@@ -140,7 +142,7 @@ def change_colors(
     return sh, opacity_logits
 
 
-def apply_looks(splats: Splats, looks: Looks) -> Splats:
+def apply_looks(splats: Splats, looks: LimitedLooks) -> Splats:
     """Return splats with paint and looks applied; crops are in the splats' space."""
     splats = apply_paint(splats)
     sh, opacity_logits = change_colors(looks, splats.means, splats.sh, splats.opacity_logits)
@@ -152,7 +154,7 @@ class RowsWithLook:
     """Splats on disk with paint and looks applied when they are read."""
 
     rows: SplatRows
-    looks: Looks
+    looks: LimitedLooks
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -162,7 +164,7 @@ class RowsWithLook:
         return apply_looks(self.rows.select(index), self.looks)
 
 
-def apply_looks_to_levels(bundle: Bundle, looks: Looks) -> Bundle:
+def apply_looks_to_levels(bundle: Bundle, looks: LimitedLooks) -> Bundle:
     """Return a bundle with paint and looks applied; levels on disk stay there until they are written."""
     levels = [
         replace(level, splats=apply_looks(level.splats, looks))

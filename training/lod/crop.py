@@ -157,6 +157,18 @@ def crop_mask(crops: Sequence[Crop], means: np.ndarray) -> np.ndarray:
     return mask
 
 
+@dataclass(frozen=True)
+class CropUnion:
+    """The inside of any of several crops, as the limit of one look."""
+
+    crops: tuple[Crop, ...]
+    outside = False
+
+    def contains(self, means: np.ndarray) -> np.ndarray:
+        """Return a mask (N,) of means (N, 3) inside a crop."""
+        return np.logical_or.reduce([crop.contains(means) for crop in self.crops])
+
+
 def is_crop_text(text: str) -> bool:
     """Return whether a text is meant for :meth:`Crop.from_text`, and is not a path."""
     return text.split(" ", 1)[0].upper() in SHAPES

@@ -12,10 +12,11 @@ from training.__main__ import main
 from training.color import linear_from_srgb, srgb_from_linear
 from training.editing.look import LUMA, NEUTRAL, Look, RowsWithLook, apply_looks
 from training.errors import LodgsError
-from training.lod.crop import Crop
+from training.lod.crop import Crop, crop_mask
 from training.scenes.cameras import Camera
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import SH_C0
+from training.splats.levels import Bundle, Level
 from training.splats.sh import basis, coefficient_count
 
 LOOK = Look(exposure=-0.7, temperature=8000, tint=(1, 0.8, 0.9), saturation=0.4, opacity=0.6)
@@ -191,6 +192,19 @@ def test_command_edits_regions_and_folders(tmp_path, capsys):
         out.unlink(missing_ok=True)
         assert main([*command, *wrong]) == 2 and not out.exists()
         assert text in capsys.readouterr().err
+
+
+def test_overlapping_crops_apply_the_look_once(tmp_path):
+    splats = random_splats(50, 1)
+    write_bundle(tmp_path / "in.ply", Bundle("", [Level(1, splats)]))
+    crops = ["--crop-sphere", "0", "0", "0", "1", "--crop-box", "-1", "-1", "-1", "1", "1", "0.5"]
+    command = ["edit", str(tmp_path / "in.ply"), "--out", str(tmp_path / "out.ply"), "--keep", "all", *crops]
+    assert main([*command, "--exposure", "1"]) == 0
+    inside = crop_mask([Crop.sphere((0, 0, 0), 1), Crop.box((-1, -1, -1), (1, 1, 0.5))], splats.means)
+    assert 0 < inside.sum() < len(inside)
+    brighter = apply_looks(splats, [(None, Look(exposure=1))])
+    expected = np.where(inside[:, None, None], brighter.sh, splats.sh)
+    np.testing.assert_array_equal(read_bundle(tmp_path / "out.ply").levels[0].splats.sh, expected)
 
 
 def test_rows_on_disk_equal_rows_in_memory():
