@@ -144,9 +144,14 @@ def _check_effects(options: argparse.Namespace) -> None:
     """
     files = [*options.plain, *options.levels]
     others = [folder for folder in (options.streamed, options.tiles) if folder is not None]
-    chosen = setting_values(options, FileOptions)
+    chosen, limits = setting_values(options, FileOptions), setting_values(options, Cleaning)
+    floaters = limits.get("drop_floaters") or limits.get("clutter")
+    uses_scene = limits.keys() & {"max_distance", "min_views"} or options.ground or options.preview
     crops = [*options.crop_box, *options.crop_sphere]
     checks = [
+        ("--gap", "gap" in limits, floaters, "--drop-floaters or --clutter"),
+        ("--share", "share" in limits, floaters, "--drop-floaters or --clutter"),
+        ("--scene", options.scene, uses_scene, "--max-distance, --min-views, --ground or --preview"),
         ("--keep outside", options.keep == "outside", crops, "--crop-box or --crop-sphere"),
         ("--antialiased", chosen.get("antialiased"), [*files, *others], "--plain, --levels or --streamed"),
         ("--original-place", chosen.get("original_place"), files, "--plain or --levels"),

@@ -49,6 +49,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.size:
         check_render_size(*options.size)
+    if options.scene and options.camera:
+        raise LodgsError("Cannot use --scene: it applies only to --view.", "Omit --scene.")
     controls = control_values(options)
     if (controls or options.by_distance) and options.level:
         raise LodgsError(

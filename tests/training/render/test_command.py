@@ -187,6 +187,7 @@ def test_holdout_hides_splats_behind_meshes(bundle, camera, tmp_path):
             "Cannot set 'offset': the rule 'bands' has no such control. Use one of: gamma, first, last.",
         ),
         (["--gamma", "1", "--level", "1"], "Cannot combine --level"),
+        (["--scene", "scene"], "Cannot use --scene: it applies only to --view. Omit --scene."),
         (["--out", "a.gif"], "Cannot write a.gif: unsupported image format"),
         (["--holdout", "gone.exr"], "Cannot read the mesh depth gone.exr"),
         (["--size", "99999999x9"], "99999999x9 pixels"),
