@@ -105,6 +105,7 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
+    from ..editing.edit import check_paths
     from ..runs.folder import find_splats
     from ..splats.formats import open_as_ply
 
@@ -120,6 +121,7 @@ def run(options: argparse.Namespace) -> int:
             "Cannot test splats against photos: their scene is missing.", "Add its folder with --scene."
         )
     outputs = _outputs(options)
+    check_paths(options.source, outputs)  # before the source is converted to a temporary file
     if not (options.preview or outputs.paths):
         raise LodgsError(
             "Cannot write the edited splats: no output.",

@@ -14,7 +14,7 @@ from ..lod.selection import check_rule
 from ..splats.bundle import open_bundle, write_bundle
 from ..splats.dialects import Warn, comments_from_meta, ignore, meta_from_comments
 from ..splats.file_rows import DrawableRows
-from ..splats.formats import find_format, find_level_format
+from ..splats.formats import MAIN_FILES, find_format, find_level_format
 from ..splats.level_folder import read_folder, write_folder
 from ..splats.levels import Bundle
 from ..splats.origin import describe_origin
@@ -129,11 +129,24 @@ def _report(bundle: Bundle, edited: Bundle, outputs: Sequence[Path], keeps_place
     return lines
 
 
+def check_paths(source: Path, outputs: Outputs) -> None:
+    """Raise a LodgsError if an output would replace the source or another output.
+
+    Args:
+        source: file or folder, or the main file of a folder.
+    """
+    places = {source.resolve(), source.resolve().parent} if source.name in MAIN_FILES else {source.resolve()}
+    for path in outputs.paths:
+        if path.resolve() in places:
+            raise LodgsError(f"Cannot write {path}: it is the source.", "Choose another output file.")
+    resolved = [path.resolve() for path in outputs.paths]
+    if twice := next((path for path in outputs.paths if resolved.count(path.resolve()) > 1), None):
+        raise LodgsError(f"Cannot write {twice}: two outputs have this name.", "Choose another output file.")
+
+
 def _check_outputs(source: Path, outputs: Outputs) -> None:
     """Raise an error before minutes of work if an output cannot be written."""
-    for path in outputs.paths:
-        if path.resolve() == source.resolve():
-            raise LodgsError(f"Cannot write {path}: it is the source.", "Choose another output file.")
+    check_paths(source, outputs)
     if outputs.out is not None and not source.is_dir() and outputs.out.suffix.lower() != ".ply":
         raise LodgsError(
             f"Cannot write {outputs.out}: it would be a PLY, the format of the source.",

@@ -356,6 +356,8 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
         (["--lod-errors", "--plain", "a.spz"], "--lod-errors: it has no effect"),
         (["--out", "all.ply"], "all.ply: it is the source"),
         (["--out", "all.sog"], "all.sog: it would be a PLY"),
+        (["--plain", "./out.ply"], "out.ply: two outputs have this name"),
+        (["--streamed", "web", "--tiles", "web"], "web: two outputs have this name"),
     ],
 )
 def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, arguments, message):
@@ -364,6 +366,17 @@ def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, arguments, 
     assert main(["edit", "all.ply", "--out", "out.ply", *arguments]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "option"), [("a.splat", "--plain"), ("web", "--streamed"), ("web/lod-meta.json", "--streamed")]
+)
+def test_converted_sources_are_not_overwritten(tmp_path, monkeypatch, capsys, source, option):
+    monkeypatch.chdir(tmp_path)
+    write_bundle("all.ply", bundle_of("bands", np.random.default_rng(10)))
+    assert main(["edit", "all.ply", "--plain", "a.splat", "--streamed", "web"]) == 0
+    assert main(["edit", source, option, source.split("/")[0], "--exposure", "1"]) == 2
+    assert "it is the source" in capsys.readouterr().err
 
 
 def test_tables_of_unknown_rules_are_rejected():
