@@ -22,6 +22,9 @@ from .errors import LodgsError, is_system_problem, missing_clause, printable, re
 
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\xb9\xb2\xb3])\s*([.:].*)?", re.I)
 
+_CLUTTER = {".DS_Store", "Thumbs.db", "desktop.ini"}
+"""Files that macOS and Windows add to folders."""
+
 
 def cache_folder() -> Path:
     """Return the user's cache folder for data that can be computed again."""
@@ -278,6 +281,22 @@ def check_folder(folder: Path, remedy: str) -> None:
         )
     if not folder.is_dir():
         raise LodgsError(f"Cannot open {folder}: the folder {missing_clause(folder)}.", remedy)
+
+
+def check_export_folder(folder: Path, main: str, others: str) -> None:
+    """Raise LodgsError if a folder is no place for an export that replaces it.
+
+    It must be missing, empty or an earlier export without other files.
+
+    Args:
+        main: name of the export's main file.
+        others: regular expression for the names of its other files and folders.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise LodgsError(f"Cannot export to {folder}: it is not a folder.", "Choose an empty folder.")
+    names = {path.name for path in folder.iterdir()} - _CLUTTER if folder.is_dir() else set()
+    if names and not (main in names and all(re.fullmatch(others, name) for name in names - {main})):
+        raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
 
 
 def create_folder(folder: Path) -> None:

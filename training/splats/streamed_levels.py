@@ -16,7 +16,7 @@ import numpy as np
 
 from ..documents import read_json
 from ..errors import LodgsError, printable
-from ..files import atomic_folder
+from ..files import atomic_folder, check_export_folder
 from .batches import batch_slices
 from .dialects import comments_from_meta
 from .gaussians import SplatRows, Splats
@@ -88,10 +88,7 @@ def write_streamed_levels(folder: Path, bundle: Bundle, measure: MeasureLeaf | N
             f"Cannot write SH degree {degree} for browsers: they support degree 0 to {MAX_DEGREE}.",
             "Reduce it with lodgs edit --sh-degree.",
         )
-    if folder.exists() and not folder.is_dir():
-        raise LodgsError(f"Cannot export to {folder}: it is not a folder.", "Choose an empty folder.")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / STREAMED_FILE).exists():
-        raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
+    check_export_folder(folder, STREAMED_FILE, r"env|\d+_\d+")
     with atomic_folder(folder) as target:
         _write_files(target, levels, degree, bundle.antialias, measure)
 

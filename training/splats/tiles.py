@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError
-from ..files import atomic_folder
+from ..files import atomic_folder, check_export_folder
 from .gaussians import SplatRows, Splats
 from .georeference import ECEF, is_geocentric
 from .gltf import COMPRESSION, SPLATS, write_compressed_glb
@@ -48,8 +48,7 @@ def write_tiles(folder: Path, levels: PortableLevels) -> None:
     Raises:
         LodgsError: the folder has other files or cannot be written.
     """
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / TILESET_FILE).exists():
-        raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
+    check_export_folder(folder, TILESET_FILE, r"cell\d+_level\d+\.glb")
     transform, bend = _earth_transform(levels.bundle, levels.sphere()[0])
     if bend is not None:
         bent = [_bend(level, bend) for level in levels.bundle.levels]

@@ -197,6 +197,11 @@ def test_streamed_levels_replace_no_foreign_files(tmp_path):
     with pytest.raises(LodgsError, match="contains other files"):
         write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, random_splats(9))]))
     assert (tmp_path / "web" / "thesis.txt").exists()
+    for _ in range(2):
+        write_streamed_levels(tmp_path / "new", Bundle("", [Level(1, random_splats(9))]))
+    (tmp_path / "new" / "index.html").touch()
+    with pytest.raises(LodgsError, match="contains other files"):
+        write_streamed_levels(tmp_path / "new", Bundle("", [Level(1, random_splats(9))]))
 
 
 @pytest.mark.parametrize("name", ["a.sog", "web"])

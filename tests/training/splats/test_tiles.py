@@ -183,6 +183,11 @@ def test_other_files_are_not_replaced(tmp_path, bundle):
     (tmp_path / "mine.txt").write_text("")
     with pytest.raises(LodgsError, match="contains other files"):
         export_tiles(tmp_path, bundle)
+    export_tiles(tmp_path / "web", bundle)
+    export_tiles(tmp_path / "web", bundle)
+    (tmp_path / "web" / "index.html").write_text("mine")
+    with pytest.raises(LodgsError, match="contains other files"):
+        export_tiles(tmp_path / "web", bundle)
 
 
 def test_one_level_is_one_tile_per_cell(tmp_path, bundle):
