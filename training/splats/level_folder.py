@@ -48,13 +48,15 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
 
     All files have the same columns, as splat-transform requires, so extras that a level lacks are omitted.
     Tables are in ``tables.ply``. No file is replaced before all are written, and the manifest is replaced
-    last. Then surplus files of an earlier export (``lodN.ply``, ``tables.ply``) are removed, and no others.
+    last. Then surplus files of an earlier export (``lodN.ply``, ``tables.ply``) are removed, and no others:
+    without its manifest, they are another program's.
 
     Raises:
         LodgsError: as `write_bundle`.
     """
     bundle.check()
     folder = Path(folder)
+    is_replaced = (folder / MANIFEST_FILE).exists()
     shared = _shared_extras(bundle)
     manifest = bundle_line(bundle) | {"levels": [], "meta": bundle.meta}
     if bundle.tables:
@@ -76,6 +78,8 @@ def write_folder(folder: str | Path, bundle: Bundle) -> None:
         manifest_file.write_text(
             json.dumps(manifest, indent=1, default=json_default, allow_nan=False) + "\n", "ascii"
         )
+    if not is_replaced:
+        return
     surplus = [
         file
         for file in folder.glob("lod*.ply")

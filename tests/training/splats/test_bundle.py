@@ -346,6 +346,14 @@ def test_replaced_folder_loses_old_levels_and_keeps_foreign_files(tmp_path, bund
     assert [level.number for level in read_folder(tmp_path).levels] == [2, 3]
 
 
+def test_files_beside_a_first_export_stay(tmp_path, bundle):
+    names = ["lod7.ply", "tables.ply"]
+    for name in names:
+        (tmp_path / name).write_text("mine")
+    write_folder(tmp_path, bundle)
+    assert [(tmp_path / name).read_text() for name in names] == ["mine", "mine"]
+
+
 def test_failed_export_leaves_the_folder_unchanged(tmp_path, bundle, monkeypatch):
     write_folder(tmp_path, bundle)
     original = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
