@@ -77,6 +77,8 @@ def compress(
     limit_degree(bundle, settings.sh_degree).check()
     plain_size = sum(Element.from_splats("", [level.rows], all_columns).size for level in bundle.levels)
     counts = [len(level.rows) for level in bundle.levels]
+    if not any(counts):
+        raise LodgsError(f"Cannot compress {source}: it has no splats.", "Choose another file.")
     run = source if run is None and path != source else run
     if run is None or not _levels_are_scenes(bundle):
         reason = "it has no training views" if run is None else "its levels are not complete scenes"

@@ -22,7 +22,7 @@ from training.scenes.colmap import read_scene
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.level_folder import write_folder
-from training.splats.levels import Bundle, Level
+from training.splats.levels import NO_SPLATS, Bundle, Level
 from training.splats.ply import write_ply
 
 
@@ -203,9 +203,11 @@ def test_levels_of_several_degrees_need_a_common_one(tmp_path, splats, capsys):
         ("missing", "a.ply", (), "missing"),
         ("run", "a.spz", (), "compressed bundles are PLY files"),
         ("run", "a.ply", ("--prune", "2"), "prune = 2.0 is invalid"),
+        ("empty.ply", "a.ply", (), "it has no splats"),
     ],
 )
 def test_mistakes_give_one_sentence(run, tmp_path, capsys, source, out, words, message):
+    write_ply(tmp_path / "empty.ply", NO_SPLATS)
     assert main(["compress", str(tmp_path / source), "--out", str(tmp_path / out), *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.startswith("error: ") and len(error.splitlines()) == 1
