@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import LodgsError
+from ..errors import LodgsError, printable
 from ..lod.rule import Rule, collect_facts
 from ..lod.selection import check_rule, require_rule, standalone_levels
 from ..scenes.view_tables import read_view_tables
@@ -142,7 +142,7 @@ def _views(bundle: Bundle) -> list[PortableView]:
     cameras, near, _ = read_view_tables(bundle.tables)
     return [
         PortableView(
-            camera.name, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+            printable(camera.name), camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
             np.linalg.inv(camera.world_to_camera), near,
         )
         for camera in cameras

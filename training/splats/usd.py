@@ -83,7 +83,11 @@ def write_usd(path: Path, levels: PortableLevels) -> None:
         LodgsError: usd-core is missing, or the file cannot be written.
     """
     usd = load_usd()
-    with atomic_write(path) as temporary, temporary_folder(path.parent) as folder:
+    if printable(path.parent) != str(path.parent):
+        raise LodgsError(
+            f"Cannot write {path}: its path is not UTF-8, as USD requires.", "Choose another folder."
+        )
+    with atomic_write(path) as temporary, temporary_folder(temporary.parent) as folder:
         scene = folder / "scene.usdc"
         try:
             _write_stage(usd, scene, levels)

@@ -14,8 +14,10 @@ from tests.training.splats.test_formats import random_splats
 from training.editing.export import FileOptions, export_levels
 from training.editing.portable import level_distances, portable_levels
 from training.errors import LodgsError
+from training.files import temporary_folder
 from training.lod.rule import resolve_rule
 from training.lod.selection import select
+from training.scenes.view_tables import make_view_tables
 from training.splats import usd as usd_module
 from training.splats.levels import Bundle, Level
 from training.splats.usd import load_usd
@@ -124,6 +126,36 @@ def test_levels_round_trip(tmp_path, ending):
     for level, original in zip(reread.levels, bundle.levels, strict=True):
         assert level.facts == original.facts
         assert_equal(level.splats, original.splats)
+
+
+def test_files_behind_links_are_prepared_beside_their_target(tmp_path, monkeypatch):
+    """A rename cannot move them to another disk."""
+    folders = []
+
+    def record(parent):
+        folders.append(parent)
+        return temporary_folder(parent)
+
+    monkeypatch.setattr(usd_module, "temporary_folder", record)
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "b.usdc").touch()
+    (tmp_path / "a.usdc").symlink_to(tmp_path / "disk" / "b.usdc")
+    export_levels(tmp_path / "a.usdc", flod(0))
+    assert folders == [tmp_path / "disk"] and (tmp_path / "a.usdc").is_symlink()
+    assert read(tmp_path / "a.usdc").method == "flod"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names")
+def test_names_that_are_not_utf_8(tmp_path):
+    folder = tmp_path / os.fsdecode(b"\xff")
+    folder.mkdir()
+    with pytest.raises(LodgsError, match="its path is not UTF-8, as USD requires"):
+        export_levels(folder / "a.usdc", flod(0))
+    bundle = flod(0)
+    bundle.tables = make_view_tables([camera(os.fsdecode(b"\xff.jpg"))], 0.05)
+    for name in ("a.usdc", "a.glb"):
+        export_levels(tmp_path / name, bundle)
+        assert read(tmp_path / name).method == "flod"
 
 
 def test_truncated_packages_are_reported(tmp_path, monkeypatch):
