@@ -86,7 +86,7 @@ def write_streamed_levels(folder: Path, bundle: Bundle, measure: MeasureLeaf | N
     if degree > MAX_DEGREE:
         raise LodgsError(
             f"Cannot write SH degree {degree} for browsers: they support degree 0 to {MAX_DEGREE}.",
-            "Reduce it with lodgs edit --sh-degree.",
+            "Reduce it with lodgs compress --sh-degree 3, and export its file.",
         )
     check_export_folder(folder, STREAMED_FILE, r"env|\d+_\d+")
     with atomic_folder(folder) as target:
