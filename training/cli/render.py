@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         raise LodgsError(
             "Cannot combine --level with selection of levels by distance.", "Use only one of them."
         )
-    with open_as_ply(options.source) if options.source.is_file() else nullcontext(options.source) as path:
+    with open_as_ply(options.source) if options.source.exists() else nullcontext(options.source) as path:
         return _render(options, RenderSource.read(path, warn), controls)
 
 

@@ -23,6 +23,7 @@ from training.splats.formats.splat import SplatFile, write_splat
 from training.splats.levels import Bundle, Level
 from training.splats.morton import spatial_order
 from training.splats.ply import write_ply
+from training.splats.streamed_levels import write_streamed_levels
 
 
 @pytest.fixture
@@ -323,3 +324,10 @@ def test_other_formats_are_rendered(make_splats, camera, tmp_path):
     source, out = str(tmp_path / "a.splat"), str(tmp_path / "a.png")
     assert main(["render", source, "--camera", str(tmp_path / "camera.json"), "--out", out]) == 0
     np.testing.assert_array_equal(pixels(tmp_path / "a.png"), expected(splats, camera))
+
+
+def test_streamed_levels_in_a_folder_are_rendered(make_splats, camera, tmp_path):
+    write_streamed_levels(tmp_path / "web", Bundle("", [Level(1, make_splats(30))]))
+    write_camera(tmp_path / "camera.json", camera, 0.01)
+    command = ["render", str(tmp_path / "web"), "--camera", str(tmp_path / "camera.json")]
+    assert main([*command, "--out", str(tmp_path / "a.png")]) == 0
