@@ -19,10 +19,13 @@ _STARTS = {b"NGSP": _SPZ, b"glTF": _GLB, b"PXR-USDC": _USDC, b"#usda": _USDA}
 """Format and suffixes by the first bytes of a file."""
 
 
-def check_name(path: Path) -> None:
+def check_name(path: Path) -> str:
     """Raise a LodgsError for checkpoints, and files with splats of another format than their name says.
 
     Formats without a signature, such as ``.splat``, are not recognised.
+
+    Returns:
+        The name of the format, or "" if it is not recognised.
 
     Raises:
         LodgsError: see above, or the file cannot be read.
@@ -41,6 +44,7 @@ def check_name(path: Path) -> None:
     name, suffixes = _recognise(path, head)
     if suffixes and not path.name.lower().endswith(suffixes):
         raise LodgsError(f"Cannot read {path}: its format is {name}.", f"Rename it to {suffixes[0]}.")
+    return name
 
 
 def _recognise(path: Path, head: bytes) -> tuple[str, tuple[str, ...]]:

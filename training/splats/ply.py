@@ -413,7 +413,9 @@ def _foreign_error(path: Path, start: bytes) -> LodgsError:
     Raises:
         LodgsError: it is a format of splats, see :func:`content.check_name`.
     """
-    check_name(path)
+    if name := check_name(path):
+        remedy = f"Convert it: lodgs edit {path.name} --out {path.stem}.ply"
+        return LodgsError(f"Cannot read {path}: its format is {name}.", remedy)
     problem, remedy = "it is not a PLY file", "Choose a .ply of Gaussian splats."
     if start.startswith((b"PK\3\4", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
         problem, remedy = "it is not a PLY file but an archive", "Unpack it."

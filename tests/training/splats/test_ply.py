@@ -11,9 +11,11 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from tests.training.splats.test_formats import random_splats
+from training.__main__ import main
 from training.errors import LodgsError
 from training.splats.file_rows import open_ply
 from training.splats.ply import BATCH_ROWS, read_elements, read_ply, splats_from_rows, write_ply
+from training.splats.spz import write_spz
 
 # Degree 1, two splats; value = splat / 2 + number of the column.
 GOLDEN_COLUMNS = [
@@ -223,6 +225,15 @@ except LodgsError as error:
     command = [sys.executable, "-c", program, tmp_path / "a.ply"]
     process = subprocess.run(command, cwd=Path(__file__).parents[3], capture_output=True, text=True)
     assert "another program has truncated it" in process.stdout, process
+
+
+@pytest.mark.parametrize("command", ["capture", "compress"])
+def test_other_formats_name_the_command_that_converts_them(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    write_spz(Path("a.spz"), random_splats(9), {})
+    assert main([command, "a.spz", "--out", "b.ply"]) == 2
+    error = "error: Cannot read a.spz: its format is SPZ. Convert it: lodgs edit a.spz --out a.ply\n"
+    assert capsys.readouterr().err == error
 
 
 def test_checkpoints_name_their_program(tmp_path):
