@@ -23,6 +23,8 @@ _MAX_TEXT = 8192
 """Maximum length of a WKT text."""
 _MAX_STORED = 1536
 """Maximum bytes of the system of a scene, as JSON: it must fit into the header of a bundle."""
+_MAX_CONDITION = 1e6
+"""Maximum ratio of the largest to the smallest scale of a transform."""
 _SURFACE = 6.2e6, 6.6e6
 """Distances in metres from the Earth's centre between which a position counts as geocentric."""
 
@@ -59,13 +61,18 @@ class Georeference:
             raise ValueError("its matrix does not have 4 x 4 numbers")
         matrix = matrix.astype(np.float64)
         is_affine = np.array_equal(matrix[3], (0, 0, 0, 1)) and np.isfinite(matrix).all()
-        if not is_affine or not 1e-12 < abs(np.linalg.det(matrix[:3, :3])) < 1e12:
+        if not is_affine or not np.linalg.cond(matrix[:3, :3]) < _MAX_CONDITION:
             raise ValueError("its matrix is no transform of space")
         return Georeference(" ".join(crs.split()), matrix)
 
     def to_json(self) -> dict:
         """Return JSON values."""
         return {"crs": self.crs, "matrix": self.matrix.tolist()}
+
+    @property
+    def is_geocentric(self) -> bool:
+        """True if the coordinates of the system are those of :data:`ECEF`."""
+        return self.crs.upper() == ECEF
 
     @property
     def zone(self) -> UtmZone | None:

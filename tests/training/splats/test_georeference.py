@@ -44,11 +44,21 @@ def test_local_tangent_plane_matches_the_published_example():
     "values",
     [[], {}, {"crs": 3}, {"crs": ""}, {"crs": "x" * 10_000}, {"crs": ECEF, "matrix": 4},
      {"crs": ECEF, "matrix": np.zeros((4, 4)).tolist()}, {"crs": ECEF, "matrix": [["a"] * 4] * 4},
-     {"crs": ECEF, "matrix": np.full((4, 4), np.nan).tolist()}],
+     {"crs": ECEF, "matrix": np.full((4, 4), np.nan).tolist()},
+     {"crs": ECEF, "matrix": np.diag([1.0, 1, 0, 1]).tolist()}],
 )  # fmt: skip
 def test_invalid_values_are_rejected(values):
     with pytest.raises(ValueError):
         Georeference.from_json(values)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_scaled_files_are_readable(tmp_path, scale):
+    levels = [Level(number, random_splats(9), {"s_min": 2.0 - number}) for number in (1, 2)]
+    bundle = Bundle("flod", levels, "bands", meta={"georeference": {"crs": ECEF}})
+    write_bundle(tmp_path / "a.ply", transform_bundle(bundle, Similarity(np.eye(3), scale, np.zeros(3))))
+    place = read_bundle(tmp_path / "a.ply").georeference
+    np.testing.assert_allclose(place.matrix, np.diag([1 / scale] * 3 + [1]))
 
 
 def test_damaged_file_is_a_warning_of_the_scene(tiny_scene, tmp_path):

@@ -133,6 +133,9 @@ def test_earth_centred_scenes_are_placed_on_the_globe(tmp_path, bundle):
     bundle.meta["origin"] = [448_250.0, 5_411_900.0, 300.0]  # UTM coordinates are not geocentric
     export_tiles(tmp_path / "web", bundle)
     assert "transform" not in load(tmp_path / "web")["root"]
+    bundle.meta["georeference"] = {"crs": "epsg:4978"}
+    export_tiles(tmp_path / "web", bundle)
+    assert "transform" in load(tmp_path / "web")["root"]
 
 
 def test_splats_on_a_map_are_at_their_places_on_the_globe(tmp_path, bundle):
