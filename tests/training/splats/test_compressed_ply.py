@@ -167,3 +167,9 @@ def test_file_that_another_program_truncates_is_reported(tmp_path):
     os.truncate(tmp_path / "a.ply", 5000)
     with pytest.raises(LodgsError, match="another program has truncated it"):
         rows.select(slice(2990, 3000))
+
+
+def test_files_with_long_comments_are_recognised(tmp_path):
+    write_compressed_ply(tmp_path / "a.ply", three_splats(), {"georeference": {"crs": "x" * 5000}})
+    with open_as_ply(tmp_path / "a.ply") as ply:
+        assert len(read_bundle(ply).levels[0].splats) == 3

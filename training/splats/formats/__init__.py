@@ -50,6 +50,8 @@ MAIN_FILES = STREAMED_FILE, SOG_FILE
 """Names of readable files with other files in their folder."""
 READABLE = (*FILE_EXTENSIONS, *MAIN_FILES)
 """Ends of the names of readable files."""
+_HEADER = 1 << 16
+"""Bytes that hold the header of a PLY, also with long comments."""
 Convert = Callable[[Path, Path], None]
 """Function that converts a splat file to a bundle, whose path is the second argument."""
 
@@ -177,4 +179,4 @@ def is_plain_ply(path: Path) -> bool:
     if not name.endswith(PLY.suffix):
         return not name.endswith(READABLE)
     with open_file(path) as file:
-        return b"packed_position" not in file.read(4096)
+        return b"packed_position" not in file.read(_HEADER)
