@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..errors import LodgsError
 from . import PROGRAM
 from .job_options import add_options, job_from_options, parse_resources
-from .options import parse_positive
+from .options import parse_positive, require_effect
 from .train import train_job
 
 if TYPE_CHECKING:
@@ -139,6 +139,8 @@ def _train(options: argparse.Namespace) -> int:
             resources=parse_resources(options.takes),
             tls=not options.no_tls,
         )
+    unused = {"--on": options.on != "here", "--no-tls": options.no_tls, "--takes": options.takes}
+    require_effect(unused, "runs without --only")
     division = read_plan(RunFolder(options.run))
     part = division.part(options.only)
     if part is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..runs.job import AUTO, KEYS
 from ..settings import check_value
-from .options import BACKEND_HELP, SOURCE_HELP, add_setting, warn
+from .options import BACKEND_HELP, SOURCE_HELP, add_setting, option_name, require_effect, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +30,9 @@ def run(options: argparse.Namespace) -> int:
 
     for name in ("views", "view_width"):
         check_value(KEYS[name], getattr(options, name))
+        if options.cameras:
+            changed = getattr(options, name) != KEYS[name].default
+            require_effect({option_name(name): changed}, "views without --cameras")
     views, points = capture(
         options.source, options.out, options.cameras or AUTO, options.views, options.view_width,
         backend=options.backend, warn=warn,

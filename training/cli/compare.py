@@ -8,7 +8,7 @@ from pathlib import Path
 from ..errors import LodgsError
 from ..files import check_folder, create_folder
 from ..settings import default_of, settings_of
-from .options import add_lpips, add_setting, lpips_archive, parse_factor, warn
+from .options import add_lpips, add_setting, lpips_archive, option_name, parse_factor, require_effect, warn
 from .progress import notify, train
 
 _JOB_KEYS = ("preset", "image_scale", "test_every", "seed", "backend")
@@ -56,6 +56,9 @@ def run(options: argparse.Namespace) -> int:
     if any(is_run) and not all(is_run):
         wrong = next(source for source, known in zip(options.sources, is_run, strict=True) if not known)
         raise LodgsError(f"Cannot compare {wrong}: it is not a run.", "Name scenes only, or runs only.")
+    if all(is_run):
+        unused = {"--methods": options.methods, "--effort": options.effort != 1}
+        require_effect(unused | {option_name(name): name in options for name in _JOB_KEYS}, "scenes")
     weights = lpips_archive(options)
     reports = []
     scenes = [None] if all(is_run) else _scene_folders(options)

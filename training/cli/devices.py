@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
+from .options import require_effect
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -18,5 +20,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     from ..rasterize.devices import Devices, describe
 
+    if options.json:
+        require_effect({"--time": options.time}, "the list of devices")
     print(json.dumps(Devices.detect().as_json()) if options.json else describe(options.time))
     return 0

@@ -217,6 +217,17 @@ def placement_of(options: argparse.Namespace) -> Similarity | None:
     return Similarity.from_matrix(np.reshape(options.matrix, (4, 4)))
 
 
+def require_effect(unused: dict[str, Any], purpose: str) -> None:
+    """Raise LodgsError if an option without effect is set.
+
+    Args:
+        unused: values of such options by name; false if they are not set.
+        purpose: what the options apply to, as the end of the sentence.
+    """
+    if word := next((word for word, value in unused.items() if value), ""):
+        raise LodgsError(f"Cannot use {word}: it applies only to {purpose}.", f"Omit {word}.")
+
+
 def warn(message: str) -> None:
     """Print a warning to standard error."""
     print(f"warning: {message}", file=sys.stderr)

@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import LodgsError
-from .options import BACKEND_HELP, SOURCE_HELP, add_controls, control_values, parse_color, parse_size, warn
+from .options import (
+    BACKEND_HELP,
+    SOURCE_HELP,
+    add_controls,
+    control_values,
+    parse_color,
+    parse_size,
+    require_effect,
+    warn,
+)
 
 if TYPE_CHECKING:
     from ..render.command import RenderSource
@@ -49,8 +58,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.size:
         check_render_size(*options.size)
-    if options.scene and options.camera:
-        raise LodgsError("Cannot use --scene: it applies only to --view.", "Omit --scene.")
+    if options.camera:
+        require_effect({"--scene": options.scene}, "--view")
     controls = control_values(options)
     if (controls or options.by_distance) and options.level:
         raise LodgsError(

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..errors import LodgsError
 from ..scenes.formats import FORMAT_NAMES
 from ..scenes.reconstruct import LENSES, PRESETS
-from .options import warn
+from .options import require_effect, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,13 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    unused = {
-        "--preset": options.preset != "draft", "--ordered": options.ordered, "--lens": options.lens,
-        "--masks": options.masks,
-    }  # fmt: skip
-    if options.source and any(unused.values()):
-        word = next(word for word, value in unused.items() if value)
-        raise LodgsError(f"Cannot use {word}: it applies only to --photos.", f"Omit {word}.")
+    if options.source:
+        unused = {
+            "--preset": options.preset != "draft", "--ordered": options.ordered, "--lens": options.lens,
+            "--masks": options.masks,
+        }  # fmt: skip
+        require_effect(unused, "--photos")
     return _reconstruct(options) if options.photos else _convert(options)
 
 
