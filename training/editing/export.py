@@ -134,7 +134,8 @@ def export_levels(path: Path, bundle: Bundle, options: FileOptions = DEFAULT_OPT
     """
     kind = find_level_format(path)
     assert kind.write_levels is not None, "it is a format of levels"
-    check_degree(kind, bundle.levels[-1].rows)
+    for level in bundle.levels:
+        check_degree(kind, level.rows)
     bundle = bundle if options.antialiased else bake_filter(bundle)
     levels, notes = portable_levels(bundle, options.original_place)
     kind.write_levels(path, levels)
@@ -147,7 +148,8 @@ def export_tiles(folder: Path, bundle: Bundle, options: FileOptions = DEFAULT_OP
     Raises:
         LodgsError: the folder has other files or cannot be written, or the degree is not supported.
     """
-    check_degree(GLB, bundle.levels[-1].rows)
+    for level in bundle.levels:
+        check_degree(GLB, level.rows)
     levels, notes = portable_levels(bundle if options.antialiased else bake_filter(bundle))
     write_tiles(folder, levels)
     return notes

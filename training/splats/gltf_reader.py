@@ -151,8 +151,9 @@ class _GlbReader:
         )
         if not same:
             return None
+        degree = max(splats.sh_degree for ((splats, _),) in fine_to_coarse)
         for level, ((splats, _),) in zip(reversed(bundle.levels), fine_to_coarse, strict=True):
-            level.splats = splats
+            level.splats = splats.padded(degree)
         return bundle
 
     def _foreign(self, fine_to_coarse: list[_PlacedParts]) -> Bundle:

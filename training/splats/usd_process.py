@@ -105,8 +105,10 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
         bundle, placement = parse_description(data[DESCRIPTION], path)
         same = all(np.allclose(matrix, placement, rtol=1e-9, atol=1e-9) for matrix in matrices)
         if same and len(bundle.levels) == count:
-            for level, prim in zip(reversed(bundle.levels), items, strict=True):
-                level.splats = _read_field(prim, path)
+            fields = [_read_field(prim, path) for prim in items]
+            degree = max(splats.sh_degree for splats in fields)
+            for level, splats in zip(reversed(bundle.levels), fields, strict=True):
+                level.splats = splats.padded(degree)
             return bundle
     placed = [
         place_splats(_read_field(prim, path), matrix, path)

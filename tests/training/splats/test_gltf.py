@@ -555,3 +555,12 @@ def test_file_that_another_program_truncates_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(gltf_reader._GlbReader, "_view", view_of_truncated)
     with pytest.raises(LodgsError, match="another program has truncated it"):
         read(tmp_path / "a.glb")
+
+
+def test_levels_of_several_degrees_return_with_the_highest(tmp_path):
+    levels = [Level(number, random_splats(9, degree)) for number, degree in ((1, 1), (2, 3))]
+    export_levels(tmp_path / "a.glb", Bundle("", levels))
+    for level, original in zip(read(tmp_path / "a.glb").levels, levels, strict=True):
+        assert_equal(level.splats, original.splats.padded(3))
+    with pytest.raises(LodgsError, match="Cannot write SH degree 4 as glTF"):
+        export_levels(tmp_path / "b.glb", Bundle("", [Level(1, random_splats(9, 4)), *levels[1:]]))

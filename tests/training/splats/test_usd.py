@@ -158,6 +158,13 @@ def test_names_that_are_not_utf_8(tmp_path):
         assert read(tmp_path / name).method == "flod"
 
 
+def test_levels_of_several_degrees_return_with_the_highest(tmp_path):
+    levels = [Level(number, random_splats(9, degree)) for number, degree in ((1, 1), (2, 3))]
+    export_levels(tmp_path / "a.usdc", Bundle("", levels))
+    for level, original in zip(read(tmp_path / "a.usdc").levels, levels, strict=True):
+        assert_equal(level.splats, original.splats.padded(3))
+
+
 def test_truncated_packages_are_reported(tmp_path, monkeypatch):
     """usd-core returns True after it filled the disk."""
     usd = load_usd()
