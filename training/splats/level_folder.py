@@ -208,6 +208,8 @@ def _read_manifest(folder: Path, warn: Warn) -> Bundle:
                 splats = splats.select(slice(begin, None))
                 begin = line["count"]
             level.splats = drop_undrawable(splats, file, warn)
+        if bundle.cumulative and len({level.sh_degree for level in bundle.levels}) > 1:
+            raise ValueError("levels that add up have different SH degrees")
         if tables := check_type(manifest.get("tables", []), list, "tables"):
             bundle.tables = pop_tables(tables, read_elements(folder / TABLES_FILE)[0])
         return bundle

@@ -448,6 +448,14 @@ def test_tables_round_trip_in_bundle_and_folder(tmp_path, bundle, same):
     assert not (tmp_path / "f" / "tables.ply").exists() and read_folder(tmp_path / "f").tables == {}
 
 
+def test_levels_that_add_up_must_have_one_degree(tmp_path, make_splats):
+    levels = [Level(number, make_splats(9)) for number in (1, 2)]
+    write_folder(tmp_path, Bundle("octree", levels, cumulative=True))
+    write_ply(tmp_path / "lod1.ply", make_splats(9, degree=1))
+    with pytest.raises(LodgsError, match="levels that add up have different SH degrees"):
+        read_folder(tmp_path)
+
+
 def test_inconsistent_tables_of_a_folder_are_refused(tmp_path, bundle):
     bundle.tables = {"chunks": {"x": np.zeros(3, "f4")}}
     write_folder(tmp_path, bundle)
