@@ -13,6 +13,8 @@ from ..errors import LodgsError
 SHAPES = ("BOX", "SPHERE")
 FACE_SQUARED = (1 + 1e-5) ** 2
 """Squared half size of a crop in its local space, with a margin that keeps points on faces inside."""
+_MAX_LENGTH = 1e30
+"""Largest number of a box or a sphere; single precision holds its inverse, too."""
 _NOWHERE = ((0.0, 0.0, 0.0, 2.0),) * 3
 """``to_local`` of a flat crop, which has no inside."""
 
@@ -48,7 +50,7 @@ class Crop:
             LodgsError: the box is flat or infinite.
         """
         low, high = np.minimum(corner, opposite), np.maximum(corner, opposite)
-        if not np.isfinite([low, high]).all():
+        if not (np.abs([low, high]) <= _MAX_LENGTH).all():
             raise LodgsError(
                 f"Cannot use the box from {corner} to {opposite}: it is infinite.", "Use finite corners."
             )
@@ -67,7 +69,7 @@ class Crop:
         Raises:
             LodgsError: the sphere is empty or infinite.
         """
-        if not np.isfinite([*center, radius]).all():
+        if not (np.abs([*center, radius]) <= _MAX_LENGTH).all():
             raise LodgsError(
                 f"Cannot use the sphere of radius {radius:g} around {center}: it is infinite.",
                 "Use finite numbers.",

@@ -75,6 +75,11 @@ class Similarity:
         Raises:
             LodgsError: the scale is not above 0, or a value is not a finite number.
         """
+        if not np.isfinite([*degrees, *translation]).all():
+            raise LodgsError(
+                "Cannot transform splats: an angle or a translation is not a finite number.",
+                "Use finite numbers.",
+            )
         matrix = np.eye(4)
         for axis, angle in enumerate(np.radians(np.asarray(degrees, np.float64))):
             turn = np.eye(4)

@@ -344,6 +344,10 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
     [
         (["--crop-box", *"000001"], "flat"),
         (["--crop-sphere", *"0000"], "radius"),
+        (["--crop-sphere", *"000", "1e300"], "it is infinite"),
+        (["--crop-box", *"00011", "1e300"], "it is infinite"),
+        (["--rotate", "inf,0,0"], "an angle or a translation is not a finite number"),
+        (["--translate", "nan,0,0"], "an angle or a translation is not a finite number"),
         (["--max-size", "0"], "Cannot edit the splats: none remain"),
         (["--min-opacity", "-1"], "min_opacity = -1.0 is invalid"),
         (["--min-views", "1"], "--scene"),
@@ -364,7 +368,8 @@ def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, arguments, 
     monkeypatch.chdir(tmp_path)
     write_bundle("all.ply", bundle_of("bands", np.random.default_rng(10)))
     assert main(["edit", "all.ply", "--out", "out.ply", *arguments]) == 2
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
     assert not (tmp_path / "out.ply").exists()
 
 
