@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import filecmp
 import os
 import platform
 import re
@@ -256,10 +257,12 @@ def link_or_copy(source: Path, target: Path) -> None:
     An existing ``target`` stays unchanged.
 
     Raises:
-        OSError: the target cannot be written.
+        OSError: the target cannot be written, or has another content.
     """
     if target.exists():
-        return
+        if os.path.samefile(source, target) or filecmp.cmp(source, target, shallow=False):
+            return
+        raise FileExistsError(errno.EEXIST, "another file has this name", str(target))
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)

@@ -267,6 +267,16 @@ def test_output_folder_gets_links_and_source_stays_unchanged(tmp_path):
         convert_export(source, out)
 
 
+def test_other_photos_in_the_output_folder_are_not_used(tmp_path):
+    write_transforms(tmp_path / "export")
+    write_photos(tmp_path / "out" / "images", NAMES[:1], (30, 20))
+    with pytest.raises(LodgsError, match=r"another file has this name \(.*first\.png\)") as error:
+        convert_export(tmp_path / "export", tmp_path / "out")
+    assert "Choose another output folder" in error.value.remedy
+    (tmp_path / "out" / "images" / NAMES[0]).unlink()
+    assert convert_export(tmp_path / "export", tmp_path / "out").views == 3
+
+
 @pytest.mark.parametrize("in_place", [False, True])
 def test_place_on_earth_beside_an_export_is_kept(tmp_path, in_place):
     source, out = tmp_path / "source", tmp_path / "out"
