@@ -153,7 +153,7 @@ class Similarity:
         transformed = dict(columns)
         for name in lengths:
             if name in transformed:
-                with np.errstate(over="ignore"):  # huge values stand for infinity
+                with np.errstate(over="ignore", invalid="ignore"):  # huge values stand for infinity
                     scaled = transformed[name] * np.float64(self.scale)
                     transformed[name] = scaled.astype(transformed[name].dtype)
         for names in positions:

@@ -173,7 +173,7 @@ def _encode(splats: Splats, header: _Header) -> tuple[np.ndarray, ...]:
         fixed.reshape(-1, 1).view(np.uint8)[:, :3],
         _to_codes(255 * splats.opacities),
         _to_codes(255 * (_COLOR_SCALE * splats.sh[:, 0] + 0.5)),
-        _to_codes(16 * (splats.log_scales + 10)),
+        _to_codes(16 * (splats.log_scales.clip(-10) + 10)),
         rotations,
         _coefficient_codes(splats.sh[:, 1:]),
     )

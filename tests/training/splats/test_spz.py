@@ -253,3 +253,11 @@ def test_damaged_files_are_refused(tmp_path, name):
     (tmp_path / "a.spz").write_bytes(BAD[name]())
     with pytest.raises(LodgsError, match="Cannot read"), open_as_ply(tmp_path / "a.spz"):
         pass
+
+
+@pytest.mark.filterwarnings("error")
+def test_extreme_sizes_become_the_smallest_without_a_warning(tmp_path):
+    splats = random_splats(3)
+    splats.log_scales[:2] = [[-1e38], [-np.inf]]
+    write_spz(tmp_path / "a.spz", splats, {})
+    np.testing.assert_array_equal(read_spz(tmp_path / "a.spz")[0].log_scales[:2], np.float32(-10))
