@@ -7,6 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ...training.editing.export import (
@@ -282,8 +283,9 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
             splats = scenes.visible_splats(context, root, self.placed, self.looked)
         path = self._path()
         meta = metadata.read_json(root.lodgs.meta)
-        if self.placed:
-            meta = {name: value for name, value in meta.items() if name not in ("origin", "georeference")}
+        if self.placed:  # in Blender's coordinates, only these remain true
+            meta = {name: meta[name] for name in ("antialias", "focal_px") if name in meta}
+            meta["up_rotation"] = np.eye(3).tolist()
         bundle = Bundle("", [Level(1, splats)], meta=meta, tables=scenes.view_tables(root, self.placed))
         if find_format(path).in_trainer:
             yield from self.follow(convert_steps(bundle, "--plain", path, self.file_options()))

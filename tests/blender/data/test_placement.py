@@ -9,6 +9,7 @@ import pytest
 from training.editing.placement import transform_bundle
 from training.lod.rules.chunks import member_columns
 from training.splats.bundle import read_bundle, write_bundle
+from training.splats.formats import open_as_ply
 from training.splats.gaussians import Splats
 from training.splats.level_folder import read_folder
 from training.splats.levels import Bundle, Level
@@ -286,6 +287,24 @@ def test_bundle_exported_as_placed_keeps_its_place(bpy, lodgs, root, tmp_path):
     bpy.ops.lodgs.export_bundle(filepath=str(tmp_path / "plain.ply"))
     unplaced = read_bundle(tmp_path / "plain.ply")
     np.testing.assert_allclose(unplaced.levels[1].splats.means, exported.levels[1].splats.means)
+
+
+def test_plain_files_exported_as_placed_stay_upright(bpy, lodgs, root, tmp_path):
+    place_root(bpy, root)
+    matrix, means = level_matrix(root), lodge_bundle().levels[1].splats.means
+    names = "a.ply", "a.compressed.ply", "a.glb"
+    for name in names:
+        bpy.ops.lodgs.export_plain(filepath=str(tmp_path / name), source="LEVEL", level=2, placed=True)
+    for name in names:
+        reimported = lodgs("data.importing").import_splats(bpy.context, tmp_path / name)
+        bpy.context.view_layer.update()
+        np.testing.assert_allclose(level_matrix(reimported), np.eye(4), atol=1e-6)
+    with open_as_ply(tmp_path / "a.glb") as ply:
+        placed = read_bundle(ply)
+    np.testing.assert_array_equal(placed.up_rotation, np.eye(3))
+    np.testing.assert_allclose(
+        placed.levels[0].splats.means, means @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5
+    )
 
 
 def test_plain_files_and_folders_are_exported_as_placed(bpy, lodgs, root, tmp_path):
