@@ -173,7 +173,7 @@ def comments_from_meta(meta: dict) -> list[str]:
     Other up directions have no comment, because readers without it assume -y up.
     """
     comments = [_MIP] if meta.get("antialias") else []
-    if np.array_equal(meta.get("up_rotation", ()), np.eye(3)):
+    if "up_rotation" in meta and np.allclose(meta["up_rotation"][2], (0, 0, 1)):  # turned at most about z
         comments.append(_Z_UP)
     if any(origin := meta.get("origin", ())):
         comments.append(_ORIGIN + " ".join(repr(float(number)) for number in origin))

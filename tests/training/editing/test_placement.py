@@ -249,3 +249,5 @@ def test_upright_plain_files_stay_upright(tmp_path):
     assert files[1].read_bytes() == files[2].read_bytes() and b"lodsplat" not in files[1].read_bytes()[:4000]
     with open_as_ply(files[3]) as ply:
         np.testing.assert_array_equal(read_bundle(ply).up_rotation, np.eye(3))
+    assert main(["edit", out, "--out", again, "--rotate", "0,0,30"]) == 0
+    np.testing.assert_array_equal(read_bundle(files[2]).up_rotation, np.eye(3))
