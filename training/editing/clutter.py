@@ -14,6 +14,7 @@ from ..scenes.ground import ground_plane, points_near_cameras
 from ..scenes.overview import FAR, LARGE, NEAR, central_ball
 from ..splats.levels import Bundle
 from ..splats.ply import read_batches
+from ..splats.portable_levels import ConcatenatedRows
 
 HALO_OPACITY, HALO_SIZE = 0.1, 0.05
 """Suggested opacity below which a splat is a halo, and its minimum size as a fraction of the subject's
@@ -107,8 +108,9 @@ def find_subject(means: np.ndarray, up: np.ndarray, ground_points: np.ndarray) -
 
 
 def subject_of(bundle: Bundle) -> SceneSubject:
-    """Return the subject of a bundle, whose finest level is read once."""
-    batches = [(splats.means, splats.opacity_logits > 0) for splats in read_batches(bundle.levels[-1].rows)]
+    """Return the subject of a bundle, whose finest level is read once, with coarser ones if levels add up."""
+    rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
+    batches = [(splats.means, splats.opacity_logits > 0) for splats in read_batches(rows)]
     means = np.concatenate([part for part, _ in batches])
     opaque = means[np.concatenate([part for _, part in batches])]
     center, depth = bundle.meta.get("camera_center"), bundle.meta.get("median_depth", 0)

@@ -18,6 +18,7 @@ from ..splats.gaussians import SplatRows, Splats
 from ..splats.georeference import Georeference
 from ..splats.levels import META_LENGTHS, NO_SPLATS, Bundle, Level
 from ..splats.ply import read_batches
+from ..splats.portable_levels import ConcatenatedRows
 from ..splats.similarity import Similarity, TransformedRows
 from .cleaning import read_relations
 
@@ -92,7 +93,7 @@ def upright_placement(
     if not ground:
         return rotation
     if points is None:
-        points = _opaque_means(bundle.levels[-1].rows)
+        points = _opaque_means(ConcatenatedRows.of_level(bundle, bundle.levels[-1].number))
     center = bundle.meta.get("camera_center")
     depth = bundle.meta.get("median_depth", 0)
     if center is not None and isinstance(depth, int | float):

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from tests.training.lod.test_rule import RULES, any_values, bundle_of
 from tests.training.lod.tree.trees import page_table, random_tree, surfaces
 from training.__main__ import main
-from training.editing.placement import transform_bundle
+from training.editing.clutter import subject_of
+from training.editing.placement import transform_bundle, upright_placement
 from training.errors import LodgsError
 from training.lod.blocks import BLOCKS
 from training.lod.rule import rules
@@ -251,3 +252,18 @@ def test_upright_plain_files_stay_upright(tmp_path):
         np.testing.assert_array_equal(read_bundle(ply).up_rotation, np.eye(3))
     assert main(["edit", out, "--out", again, "--rotate", "0,0,30"]) == 0
     np.testing.assert_array_equal(read_bundle(files[2]).up_rotation, np.eye(3))
+
+
+def test_ground_and_subject_are_those_of_all_levels_that_add_up():
+    """The coarse level has the ground, the fine one adds details above it."""
+    rng = np.random.default_rng(0)
+    ground, details = surfaces(2000), surfaces(200)
+    ground.means = np.column_stack([rng.uniform(-5, 5, (2000, 2)), rng.normal(-2, 0.005, 2000)]).astype("f4")
+    details.means = rng.normal(0, 0.5, (200, 3)).astype("f4")
+    for splats in (ground, details):
+        splats.opacity_logits[:] = 3
+    bundle = Bundle("", [Level(1, ground), Level(2, details)], cumulative=True)
+    bundle.meta["up_rotation"] = np.eye(3).tolist()
+    placement = upright_placement(bundle, ground=True)
+    np.testing.assert_allclose(placement.translation, (0, 0, 2), atol=0.02)
+    assert subject_of(bundle).radius > 3
