@@ -15,7 +15,7 @@ from ...training.errors import LodgsError
 from ...training.lod.rule import Masks
 from ..attributes import BASE, SCALE
 from . import changes, cleaning
-from .ground import ground_points
+from .ground import finest_levels, ground_points
 from .placement import placement_of
 from .setting_properties import property_of
 
@@ -226,15 +226,16 @@ def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
     Raises:
         LodgsError: the finest level has no splats, or the root is scaled differently along its axes.
     """
-    cloud = root.lodgs.existing_levels[-1].object.data
-    if not len(cloud.points):
+    clouds = [obj.data for obj in finest_levels(root)]
+    if not any(len(cloud.points) for cloud in clouds):
         raise LodgsError(
             f"Cannot find clutter: the finest level of '{root.name}' has no splats.", "Undo their removal."
         )
     up = placement_of(root).rotation.T @ (0.0, 0.0, 1.0)
-    key = cloud.session_uid, len(cloud.points), changes.version(cloud), tuple(up)
+    states = [(cloud.session_uid, len(cloud.points), changes.version(cloud)) for cloud in clouds]
+    key = tuple(states), tuple(up)
     if not _subject or _subject[0] != key:
-        means = cleaning.splat_attribute(cloud, "position")
+        means = np.concatenate([cleaning.splat_attribute(cloud, "position") for cloud in clouds])
         _subject[:] = [key, clutter.find_subject(means, up, ground_points(root))]
     return _subject[1]
 

@@ -121,19 +121,25 @@ def measure_distance(positions: np.ndarray) -> float:
     return distance
 
 
+def finest_levels(root: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the object of the finest level, with those of coarser ones if levels add up."""
+    objects = [item.object for item in root.lodgs.existing_levels]
+    return objects if root.lodgs.cumulative else objects[-1:]
+
+
 def ground_points(root: bpy.types.Object) -> np.ndarray:
     """Return the points (P, 3) for ground detection, in the scene's coordinates.
 
-    These are COLMAP's points, or the means of the finest level's opaque splats. If the median depth is known,
-    only points near the cameras are returned.
+    These are COLMAP's points, or the means of the finest level's opaque splats, with coarser ones if levels
+    add up. If the median depth is known, only points near the cameras are returned.
     """
-    levels = [item.object for item in root.lodgs.existing_levels][-1:]
-    obj = root.lodgs.points or (levels[0] if levels else None)
-    positions = None if obj is None else read_attribute(obj.data, "position")
-    if positions is None:
-        return np.zeros((0, 3))
-    base = read_attribute(obj.data, BASE)
-    positions = positions if base is None else positions[base[:, 3] > 0.5]
+    objects = [root.lodgs.points] if root.lodgs.points else finest_levels(root)
+    parts = [np.zeros((0, 3), np.float32)]
+    for obj in objects:
+        if (positions := read_attribute(obj.data, "position")) is not None:
+            base = read_attribute(obj.data, BASE)
+            parts.append(positions if base is None else positions[base[:, 3] > 0.5])
+    positions = np.concatenate(parts)
     depth = root.lodgs.training.median_depth or read_json(root.lodgs.meta).get("median_depth", 0)
     return points_near_cameras(
         positions, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0

@@ -374,3 +374,14 @@ def test_export_of_a_reopened_hidden_scene_is_placed_and_cropped(bpy, lodgs, tmp
     after = [level.splats.means for level in read_levels(bpy.data.objects["in"], placed=True).levels]
     for means, expected in zip(after, before, strict=True):
         np.testing.assert_allclose(means, expected, atol=1e-4)
+
+
+def test_ground_and_subject_are_those_of_all_levels_that_add_up(bpy, lodgs, tmp_path):
+    levels = [Level(1, random_splats(200, 1)), Level(2, random_splats(50, 2))]
+    levels[0].splats.means[:, 0] += 100
+    for level in levels:
+        level.splats.opacity_logits[:] = 3
+    write_bundle(tmp_path / "a.ply", Bundle("", levels, cumulative=True))
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "a.ply")
+    assert len(lodgs("data.ground").ground_points(root)) == 250
+    assert lodgs("data.cleanup_tests").subject_of(root).center[0] > 90
