@@ -151,6 +151,7 @@ def _check_effects(options: argparse.Namespace) -> None:
     uses_scene = limits.keys() & {"max_distance", "min_views"} or options.ground or options.preview
     crops = [*options.crop_box, *options.crop_sphere]
     checks = [
+        ("--halo-opacity 0", limits.get("halo_opacity") == 0, False, "a value above 0"),
         ("--gap", "gap" in limits, floaters, "--drop-floaters or --clutter"),
         ("--share", "share" in limits, floaters, "--drop-floaters or --clutter"),
         ("--scene", options.scene, uses_scene, "--max-distance, --min-views, --ground or --preview"),

@@ -353,6 +353,7 @@ def test_folder_stays_a_folder_and_counts_are_printed(tmp_path, capsys):
         (["--min-views", "1"], "--scene"),
         (["--keep", "outside"], "--keep outside: it has no effect"),
         (["--antialiased"], "--antialiased: it has no effect"),
+        (["--clutter", "--halo-opacity", "0"], "--halo-opacity 0: it has no effect"),
         (["--gap", "1"], "--gap: it has no effect"),
         (["--share", "0.1", "--max-size", "1"], "--share: it has no effect"),
         (["--scene", "."], "--scene: it has no effect"),
