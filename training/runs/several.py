@@ -93,7 +93,7 @@ class ReducedJobs:
         if self._pixel_ratio < 1:
             preset = info.preset(self.preset)
             parameters |= {
-                f.name: self._pixel_ratio * getattr(preset, f.name)
+                f.name: max(self._pixel_ratio * getattr(preset, f.name), f.metadata["low"])
                 for f in info.fields
                 if f.metadata["unit"] == "px" and f.name not in parameters
             }

@@ -67,6 +67,11 @@ def test_effort_keeps_sizes_in_pixels_the_same_in_the_scene(tiny_scene, tmp_path
     assert trained(0.1, 0.25, {parameter: 2.0}) == 2.0
 
 
+def test_effort_keeps_sizes_in_pixels_above_their_minimum(tiny_scene, tmp_path):
+    jobs = ReducedJobs(tiny_scene, "draft", 0.01, {"image_scale": 0.05})
+    assert jobs.job("tree", tmp_path / "run").resolved_parameters().pixels == 0.1
+
+
 @pytest.fixture
 def jobs(tiny_scene, tmp_path):
     keys = {"scene": str(tiny_scene), "method": "3dgs", "image_scale": 1.0, "backend": "cpu"}
