@@ -6,6 +6,7 @@ Splats are parametrised as in 3DGS files (``training.splats.gaussians``), as tor
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 import torch
@@ -100,8 +101,8 @@ class Model:
         if self._device_model is not None or FROZEN in self.columns:
             return self._device_model
         model = make_step_model(backend, self._adam, self._stats, antialias=antialias)
-        if isinstance(model, DeviceModel):
-            self._device_model = model
+        if hasattr(model, "copy_to_host"):  # isinstance with a protocol is slow
+            self._device_model = cast(DeviceModel, model)
         return model
 
     def read(self, name: str) -> torch.Tensor:

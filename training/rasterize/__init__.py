@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from types import ModuleType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -303,7 +303,6 @@ class StepModel(Protocol):
         ...
 
 
-@runtime_checkable
 class DeviceModel(StepModel, Protocol):
     """Splats in device memory.
 
