@@ -32,7 +32,7 @@ class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
     footprint: float = setting(
         16.0,
         "Detail of level 1, in pixels at the scene's median depth: its minimum splat size (FLoD: lambda). "
-        "Sets the distances of trained levels, and in regions and cells those of merged levels.",
+        "Sets the distances of trained levels, and in regions those of merged levels.",
         label="Coarsest Detail",
         above=0,
         unit="px",
@@ -62,7 +62,7 @@ class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
         "merged",
         "Source of the coarser levels. 'merged' trains the finest level first, then merges each coarser "
         "level from the next finer one and refines it. 'trained' trains from coarse to fine with minimum "
-        "splat sizes, as in the paper, and is always used in runs of only some levels.",
+        "splat sizes, as in the paper, and is always used in cells and in runs of only some levels.",
         choices=("merged", "trained"),
     )
     first_level: int = setting(
@@ -201,5 +201,6 @@ METHOD = MethodInfo(
     panel_parameters=("levels", "footprint", "max_splats"),
     cell_method="flod",
     split_parameters=divide,
+    cell_values={"levels_from": "trained"},  # cells agree on the distances of these levels
     trains_on_device=lambda parameters: True,
 )

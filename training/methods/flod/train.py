@@ -97,7 +97,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             self.start_level(self.level_at(step + 1))
             return levels
         if p.merges:
-            if self.data.region is None:  # the cells of a scene share the distances of the footprint
+            if self.data.region is None:
                 self.s_min = self.merged.measure_min_sizes(self.completed, self.controls["gamma"], p.rho)
             levels = self._completed_levels()
         if p.finish_steps and self.completed:

@@ -166,6 +166,8 @@ def test_coarse_part_and_cells_share_the_levels(tiny_scene, tmp_path):
     planned(shallow)
     division = read_plan(RunFolder(shallow.out))
     assert division.coarse is None and division.cells[0].job.base == ""
+    # merged levels would have distances that differ between cells
+    assert not any(cell.job.resolved_parameters().merges for cell in division.cells)
 
 
 def test_seams_need_polish_steps_and_a_rule_without_weights(tiny_scene, tmp_path):
