@@ -231,7 +231,7 @@ class Method(method.Method[NeuralOctreeParameters, NeuralDrawing]):
     def loss(self, drawings: Sequence[NeuralDrawing], view: TrainingView, step: int) -> torch.Tensor:
         """Return the loss with volume regularization (Octree-GS, Sec. 7.1)."""
         scales = drawings[0].decoded.scales / self.data.median_depth
-        volume = self.parameters.volume_weight * scales.prod(1).mean()
+        volume = self.parameters.volume_weight * growing.mean_volume(scales)
         return super().loss(drawings, view, step) + volume
 
     def set_learning_rates(self, step: int) -> None:

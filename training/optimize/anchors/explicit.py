@@ -93,7 +93,7 @@ class ExplicitAnchors(Method[OctreeParameters, Drawing]):
             return loss
         drawn = drawings[0].rendering.radii > 0
         scales = self.model["log_scales"][drawn].exp() / self.data.median_depth
-        return loss + self.parameters.volume_weight * scales.prod(1).mean()
+        return loss + self.parameters.volume_weight * growing.mean_volume(scales)
 
     def set_learning_rates(self, step: int) -> None:
         p, lr = self.parameters, self.schedule.learning_rates(self._rates, step)

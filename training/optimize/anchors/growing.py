@@ -1,4 +1,4 @@
-"""Creation, growth, pruning and level changes of octree anchors, shared by explicit and neural anchors.
+"""Creation, growth, pruning, level changes and volumes of octree anchors, explicit and neural.
 
 A model of anchors has the columns ``level`` and ``bias``. Its statistics are per anchor, (N,), or per
 Gaussian of an anchor, (N, n).
@@ -202,3 +202,8 @@ def matching_levels(
     narrow = narrow[torch.from_numpy(needed).to(narrow.device)]
     level = level.index_copy(0, narrow, finer[narrow])
     return torch.minimum(level, coarser.floor().clamp_min(1))
+
+
+def mean_volume(scales: torch.Tensor) -> torch.Tensor:
+    """Return the mean product of scales (M, 3), 0 if a view draws no splats (Octree-GS, Sec. 7.1)."""
+    return scales.prod(1).sum() / max(len(scales), 1)

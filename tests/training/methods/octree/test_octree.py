@@ -313,6 +313,12 @@ def test_volume_uses_median_depths(data):
     assert float(total.detach()) == pytest.approx(float((without + expected).detach()), rel=1e-5)
 
 
+def test_view_without_splats_has_a_finite_loss(data):
+    octree = make(data, volume_weight=2.0)
+    octree.model["opacity_logits"].data[:] = -30
+    assert octree.train_step(0).loss() > 0
+
+
 def test_levels_add_up_to_all_splats_with_their_bias(data):
     octree = make(data, steps=8, coarse_share=0.5)
     completed = {}

@@ -136,6 +136,12 @@ def test_anchors_without_gaussians_are_removed(data, monkeypatch):
     assert len(method.model) == initial - 5 + unseen
 
 
+def test_view_without_gaussians_has_a_finite_loss(data):
+    method = make(data)
+    method.model["looks"].data[..., 0] = -30
+    assert method.train_step(0).loss() > 0
+
+
 def draw(splats, camera, data):
     return rasterize(Gaussians.of(splats), camera, near=data.near).image
 
