@@ -68,7 +68,7 @@ class MergedLevels:
             finest_count: number of splats of the finest level.
         """
         p, finest = self._parameters, self._stages.level_at(0)
-        count = round(p.share_below(finest - number) * finest_count)
+        count = max(round(p.share_below(finest - number) * finest_count), 1)
         if number == finest - 1:
             finer = drop_invisible(finer, count, self._data, p, self._backend)
         tensors = from_splats(merge(finer, count), p.sh_degree, tensor_device(self._backend))

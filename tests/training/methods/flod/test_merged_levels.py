@@ -41,6 +41,11 @@ def error(flod, splats, factor: int = 1) -> float:
     return float(np.mean(errors))
 
 
+def test_single_splat_is_merged_to_one(data):
+    *_, coarse, middle, finest = (level for _, _, level in train(make(data, max_splats=1, margin=0.0)))
+    assert len(coarse.splats) == len(middle.splats) == len(finest.splats) == 1
+
+
 def test_finest_level_is_first_after_previews(data):
     flod = make(data, free_depth=0.0, largest=0.0)
     completed = [(step, trained, level.number, len(level.splats)) for step, trained, level in train(flod)]
