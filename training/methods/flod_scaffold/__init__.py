@@ -71,7 +71,8 @@ class FlodScaffoldParameters(FlodLevels, NeuralOctreeParameters):
         """Return the parameters that train a level (1-based): those of an octree with one level."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(NeuralOctreeParameters)}
         values |= {name: values[name][number - 1] for name in ("steps", "grow_until", "grow_interval")}
-        limit = self.max_splats and int(self.max_splats * self.budget_ratio ** (self.levels - number))
+        share = int(self.max_splats * self.budget_ratio ** (self.levels - number))
+        limit = min(max(share, 2 * self.offsets), self.max_splats)  # at least one anchor besides margins
         values |= ONE_LEVEL | {"max_splats": limit}
         return NeuralOctreeParameters(**values)
 

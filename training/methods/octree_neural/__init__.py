@@ -77,9 +77,10 @@ class NeuralOctreeParameters(OctreeParameters):
 
     def check(self) -> None:
         super().check()
-        if self.splat_limit < self.offsets:
+        if self.growth_limit(self.splat_limit) < self.offsets:
             raise LodgsError(
-                f"'max_splats' is {self.max_splats}, but one anchor needs {self.offsets} Gaussians.",
+                f"'max_splats' is {self.max_splats}, but one anchor needs {self.offsets} Gaussians, besides "
+                "those of margins.",
                 "Give a larger number.",
             )
 

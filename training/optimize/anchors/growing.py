@@ -127,7 +127,7 @@ def limit_growth(
         max_anchors: maximum number of anchors of the model.
     """
     p = schedule.parameters
-    share = min((step + 1) / (p.grow_until * p.steps), 1.0) ** p.room_exponent
+    share = min((step + 1) / max(p.grow_until * p.steps, 1), 1.0) ** p.room_exponent
     room = int(max_anchors * share) - len(model)
     free = _free_positions(schedule, model, rows["means"], rows["level"])[: max(room, 0)]
     return {name: row[free] for name, row in rows.items()}

@@ -139,6 +139,18 @@ def test_levels_respect_their_budgets(data):
     assert counts[0] <= 10 and counts[1] == 20 and counts[2] == 40  # 3 Gaussians per anchor: 30, 60 and 120
 
 
+def test_levels_need_no_growth(data):
+    method = make(data, grow_until=0.0)
+    assert [level.number for level in trained(method)] == [1, 2, 3]
+
+
+def test_levels_have_an_anchor_with_few_splats(data):
+    method = make(data, max_splats=20, budget_ratio=0.1)
+    levels = trained(method)
+    assert [level.number for level in levels] == [1, 2, 3]
+    assert len(levels[0].splats) <= len(levels[2].splats) <= 20
+
+
 def test_schedule_restarts_at_each_level(data):
     """Growth, statistics and learning rates follow the steps of the level."""
     method = make(data, preset="paper", steps=[6000] * 3, grow_interval=[500, 500, 200])

@@ -40,6 +40,9 @@ def test_anchors_are_at_voxel_centres(data):
 def test_initial_gaussians_respect_max_splats(data):
     assert len(make(data).model) > 10
     assert len(make(data, max_splats=43, offsets=4, margin=0.0).model) == 10
+    assert len(make(data, max_splats=10, offsets=10, margin=0.0).model) == 1
+    with pytest.raises(LodgsError, match="one anchor needs 10 Gaussians, besides those of margins"):
+        make(data, max_splats=10, offsets=10, margin=0.5)
 
 
 @pytest.mark.parametrize("changes", [{"direct": False}, {}, {"view_shapes": False}])
