@@ -25,8 +25,13 @@ from ...files import atomic_write
 
 PORT = 8786
 """Port of a scheduler; Dask's default."""
-NO_HTTP = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-"""Dask configuration without web pages. Dask opens its HTTP servers even without pages."""
+CONFIGURATION = {
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "warning",
+}
+"""Dask configuration without web pages, and without routine messages of the processes of workers. Dask opens
+its HTTP servers even without pages."""
 _HTTP_ADDRESS = "127.0.0.1:0"
 _SCHEDULER_CLOSES = "scheduler-close"
 """Dask's reason to close a worker when its scheduler is stopped."""
@@ -59,7 +64,7 @@ def local_cluster(count: int, resources: dict[str, float] | None = None) -> Any:
     import dask.config
 
     distributed = import_dask()
-    with dask.config.set(NO_HTTP):
+    with dask.config.set(CONFIGURATION):
         return distributed.LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, resources=resources,
             silence_logs=logging.ERROR, preload=[_IGNORE_INTERRUPT],
@@ -139,7 +144,7 @@ def run_scheduler(path: Path, host: str | None = None, port: int = PORT) -> None
             await scheduler.finished()
 
     logging.getLogger("distributed").setLevel(logging.WARNING)
-    with dask.config.set(NO_HTTP):
+    with dask.config.set(CONFIGURATION):
         try:
             _run(serve)
         except (OSError, RuntimeError, ValueError) as error:
@@ -174,12 +179,13 @@ def run_worker(path: Path, resources: dict[str, float] | None = None) -> None:
     async def serve() -> None:
         async with Nanny(
             address, nthreads=1, security=security, resources=resources, dashboard=False,
-            dashboard_address=_HTTP_ADDRESS, silence_logs=logging.WARNING,
+            dashboard_address=_HTTP_ADDRESS,
         ) as nanny:  # fmt: skip
             print(f"Worker of {address}.", flush=True)
             await nanny.finished()
 
-    with dask.config.set(NO_HTTP):
+    logging.getLogger("distributed").setLevel(logging.WARNING)
+    with dask.config.set(CONFIGURATION):
         try:
             _run(serve)
         except (OSError, RuntimeError, ValueError) as error:
