@@ -88,7 +88,7 @@ class RunFolder:
             self.reject_links()
             self.levels_folder.mkdir(exist_ok=True)
             end = self.end_event()
-            if end is None or end["event"] != "done":
+            if end is None or end["event"] != "done" or not self.bundle.exists():
                 self.checkpoints.mkdir(exist_ok=True)
         except OSError as error:
             raise LodgsError(

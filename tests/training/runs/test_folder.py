@@ -13,6 +13,7 @@ import pytest
 from training.errors import LodgsError
 from training.files import atomic_write
 from training.runs import processes
+from training.runs.events import event_line
 from training.runs.folder import RunFolder, find_splats
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -56,6 +57,17 @@ def test_links_in_a_run_are_rejected(run, tmp_path, name):
     with pytest.raises(LodgsError, match="is a link or a special file"):
         run.create()
     assert not (tmp_path / "outside").exists()
+
+
+def test_finished_run_has_a_folder_for_checkpoints_only_without_its_bundle(run):
+    run.events_file.write_text(event_line("done") + "\n")
+    run.bundle.touch()
+    run.checkpoints.rmdir()
+    run.create()
+    assert not run.checkpoints.exists()
+    run.bundle.unlink()
+    run.create()
+    assert run.checkpoints.is_dir()
 
 
 def test_find_file_rejects_paths_outside_the_run(run, tmp_path):
