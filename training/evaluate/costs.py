@@ -169,7 +169,11 @@ class _Plot:
 
 
 def _ticks(maximum: float) -> np.ndarray:
-    """Return round numbers from 0 to the first that is not below ``maximum``, four to nine of them."""
+    """Return round numbers from 0 to the first that is not below ``maximum``, four to nine of them.
+
+    They reach 1 if the maximum is 0, as for costs of views without splats.
+    """
+    maximum = maximum or 1.0
     scale = 10.0 ** np.floor(np.log10(max(maximum, 1e-12)))
     step = next(step * scale for step in (0.2, 0.5, 1, 2) if maximum <= 5 * step * scale)
     return step * np.arange(np.ceil(maximum / step) + 1)

@@ -51,6 +51,13 @@ def test_plot_draws_points_at_their_values(tmp_path):
             assert np.hypot(columns - x, rows - y).min() < 2
 
 
+def test_costs_of_views_without_splats_are_plotted(tmp_path):
+    write_cost_plot(
+        tmp_path / "a.png", {"costs": [{"level": 1, "distances": [2.0, 4.0], "costs": [0.0, 0.0]}]}
+    )
+    assert costs._ticks(0.0)[-1] == 1
+
+
 @pytest.mark.parametrize("maximum", [1e-9, 0.049, 1, 1.0001, 4.2, 50, 51, 830, 99_999])
 def test_ticks_are_round_and_cover_the_range(maximum):
     ticks = costs._ticks(maximum)
