@@ -16,6 +16,7 @@ from training.methods import METHODS
 from training.runs.comparison.measures import (
     ComparedRun,
     Point,
+    collect_measures,
     compared_run,
     label_runs,
     measure_run,
@@ -167,6 +168,11 @@ def test_answers_name_the_best_run_and_ignore_baselines():
         "why": "31.00 dB with 200 splats", "next": "A (30.00 dB)",
     }  # fmt: skip
     assert "Speed from far away" not in best  # neither has levels
+
+
+def test_single_splats_are_compared():
+    run = ComparedRun("run", "", [Point("", 1, 20.0, 0.5, 0.1)], loaded=1)
+    assert collect_measures([run])["compared_splats"] == 1
 
 
 def test_page_loads_nothing_and_escapes_names(report):

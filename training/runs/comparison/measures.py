@@ -309,7 +309,7 @@ def collect_measures(runs: Sequence[ComparedRun]) -> dict:
     """Return the measures of runs as plain values for JSON."""
     count = compared_count(runs)
     rows = [{**asdict(run), "largest_jump": run.largest_jump, "at_share": run.psnr_at(count)} for run in runs]
-    return {"compared_splats": round(count), "runs": rows, "answers": recommend_runs(runs)}
+    return {"compared_splats": max(round(count), 1), "runs": rows, "answers": recommend_runs(runs)}
 
 
 def label_runs(runs: Sequence[Path]) -> list[str]:
