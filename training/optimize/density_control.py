@@ -142,7 +142,7 @@ def require_rows(model: Model, step: int, parameter: str) -> None:
     if not len(model):
         raise LodgsError(
             f"Cannot continue training: no splats remain at step {step + 1}.",
-            f"Lower '{parameter}', or choose another preset.",
+            f"Lower or disable '{parameter}', or choose another preset.",
         )
 
 

@@ -111,7 +111,7 @@ def test_position_rate_decays_exponentially(data):
 
 def test_transparent_model_raises(data):
     method = make(data, steps=10, prune_interval=1, min_opacity=1.0)
-    with pytest.raises(LodgsError, match=r"no splats remain at step 1.*'min_opacity'"):
+    with pytest.raises(LodgsError, match=r"no splats remain at step 1.*Lower or disable 'min_opacity'"):
         method.train_step(0)
 
 
