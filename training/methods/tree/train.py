@@ -11,6 +11,7 @@ Density control (Sec. 4.2) rewrites the store (``density``).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -104,9 +105,11 @@ class Method(RefiningMethod):
 
     def setup(self, base: SplatRows | None) -> None:
         super().setup(None if base is None else base.select(slice(0, 0)))
-        if base is None and self.parameters.sky_points:
-            points, colors = self.sky_points(self.parameters.sky_points)
-            self.model.append(from_points(points, colors, self.parameters.sh_degree, self.device))
+        p = self.parameters
+        if base is None and p.sky_points:
+            points, colors = self.sky_points(p.sky_points)
+            self.model.append(from_points(points, colors, p.sh_degree, self.device))
+            self.parameters = replace(p, max_splats=p.max_trained_splats)
         # density control and margins belong to the 3DGS steps only
         self._densify_until = min(self._densify_until, self.finest_steps)
         self.levels = LEAVES

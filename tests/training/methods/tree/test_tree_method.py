@@ -95,6 +95,15 @@ def test_first_steps_are_3dgs(data):
     torch.testing.assert_close(tree.model["means"], plain.model["means"])
 
 
+def test_sky_points_leave_room_for_other_splats(data):
+    values = {"max_splats": 70, "grad_threshold": 1e-9, "densify_interval": 2}
+    plain, tree = make(data, **values), make(data, sky_points=200, **values)
+    for step in range(4):
+        plain.train_step(step)
+        tree.train_step(step)
+    assert (len(plain.model), len(tree.model)) == (70, 270)
+
+
 def test_sky_points_lie_evenly_on_a_sphere(data, base):
     """Off by default; A.2: the initial points are augmented with a sky."""
     plain, tree = make(data), make(data, sky_points=200)
