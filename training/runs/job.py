@@ -262,6 +262,11 @@ class Job:
                 f"The method '{self.method}' cannot train a scene in cells.",
                 "Choose another method, or remove 'cells'.",
             )
+        if not self.resolved_parameters().base_steps:
+            raise LodgsError(
+                "Cannot train a single level in cells: the merged cells already are that level.",
+                "Set levels to 2 or more, or choose the method 3dgs.",
+            )
 
     def warnings(self) -> list[str]:
         """Return warnings about settings that contradict each other but are valid."""

@@ -248,6 +248,8 @@ def test_invalid_cells_are_rejected(tiny_scene, tmp_path):
             job_for(tiny_scene, tmp_path / "run", cells=cells)
     with pytest.raises(LodgsError, match="cannot train a scene in cells"):
         job_for(tiny_scene, tmp_path / "run", "octree_neural", parameters={})
+    with pytest.raises(LodgsError, match="single level in cells"):
+        job_for(tiny_scene, tmp_path / "run", "lodge", parameters={"levels": 1})
     with pytest.raises(LodgsError, match="both 'cells' and 'region'"):
         job_for(tiny_scene, tmp_path / "run", region="region.json")
     with pytest.raises(LodgsError, match="each cell needs"):
