@@ -19,7 +19,7 @@ from ...settings import setting
 BLENDED_LEVELS = 3
 """Number of finest levels that are blended by default (``Bands.defaults``) and that finishing steps train."""
 CELL_LEVELS = 2
-"""Number of finest levels that are trained cell by cell in a divided scene."""
+"""Number of finest trained levels that are trained cell by cell in a divided scene."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def divide(parameters: FlodParameters) -> tuple[FlodParameters, FlodParameters] 
 
     None if there are not enough levels to divide.
     """
-    coarse = parameters.levels - CELL_LEVELS
+    coarse = parameters.end - CELL_LEVELS
     if coarse < 1:
         return None
     return replace(parameters, last_level=coarse), replace(parameters, first_level=coarse + 1)

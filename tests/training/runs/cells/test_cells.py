@@ -166,6 +166,13 @@ def test_coarse_part_and_cells_share_the_levels(tiny_scene, tmp_path):
     planned(shallow)
     division = read_plan(RunFolder(shallow.out))
     assert division.coarse is None and division.cells[0].job.base == ""
+    for last, (coarse, first) in {2: (None, 1), 4: (2, 3)}.items():
+        folder = tmp_path / f"last_{last}"
+        planned(job_for(tiny_scene, folder, "flod", parameters={"last_level": last}))
+        parts = read_plan(RunFolder(folder))
+        assert coarse == (parts.coarse and parts.coarse.job.resolved_parameters().last_level)
+        cell_levels = parts.cells[0].job.resolved_parameters()
+        assert (cell_levels.first_level, cell_levels.end) == (first, last)
     # merged levels would have distances that differ between cells
     assert not any(cell.job.resolved_parameters().merges for cell in division.cells)
 
