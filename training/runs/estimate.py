@@ -14,7 +14,7 @@ import torch
 from ..errors import LodgsError
 from ..evaluate.messages import format_duration
 from ..methods import METHODS, create
-from ..optimize.initialize import neighbor_scale
+from ..optimize.initialize import MIN_POINTS, neighbor_scale
 from ..optimize.memory import MAX_BYTES, TARGET_BYTES, free_memory, peak_memory, reset_peak_memory
 from ..optimize.method import Method
 from ..optimize.parameters import Parameters
@@ -118,7 +118,8 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     if backend == "cuda":
         torch.cuda.reset_peak_memory_stats()
     reset_peak_memory()
-    late, growing, data = _measure(job, parameters, _with_points(scene, splats), backend, scratch, last=True)
+    grown = _with_points(scene, max(splats, MIN_POINTS))
+    late, growing, data = _measure(job, parameters, grown, backend, scratch, last=True)
     width, height = data.train[0].width, data.train[0].height
     photos = sum(TARGET_BYTES * camera.width * camera.height for camera in data.train)
     photos = max(min(photos, job.photo_memory * 10**6 or MAX_BYTES) - data.images.held_bytes, 0)

@@ -70,6 +70,11 @@ def test_coarse_levels_before_the_finest_one_count_as_growth(job, tmp_path, monk
     assert module.START_SECONDS < costs.seconds - expected < module.START_SECONDS + 60
 
 
+def test_single_splats_have_an_estimate(job, tmp_path):
+    parameters = {"max_splats": 1, "steps": 4}
+    assert estimate(replace(job, method="3dgs", parameters=parameters), tmp_path).splats == 1
+
+
 def test_estimate_of_a_tree_measures_its_leaves(job, tmp_path):
     """Steps on cuts need the tree, which later steps build."""
     parameters = {"max_splats": 90, "steps": 40, "tune_steps": 400}
