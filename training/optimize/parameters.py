@@ -187,8 +187,8 @@ class DensityParameters(Parameters):
     )
     far_share: float = setting(
         0.25,
-        "Fraction of the steps with full-size images that reduce their image by 2 or 4 instead, as if seen "
-        "from farther away. Improves small images.",
+        "Fraction of the steps after density control that reduce their image by 2 or 4, as if seen from "
+        "farther away. Improves small images.",
         high=1,
     )
     long_axis: bool = setting(

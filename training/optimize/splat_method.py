@@ -66,7 +66,9 @@ class SplatMethod(Method[SplatParameters, Drawing]):
     def shrink(self, step: int) -> float:
         p = self.parameters
         factor = shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
-        return factor if factor > 1 else random_reduction(self.seed, step, p.far_share)
+        if factor > 1 or step < self._densify_until:
+            return factor
+        return random_reduction(self.seed, step, p.far_share)
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         return self.dropout.weights(len(self.model), step, step / self.scheduled_steps), 0.0

@@ -41,7 +41,7 @@ def test_first_steps_use_reduced_images_and_last_steps_full_ones(data, name):
 
 @pytest.mark.parametrize("name", ["3dgs", "flod", "matryoshka"])
 def test_some_steps_see_the_scene_from_farther_away(data, name):
-    """A quarter of the steps after half of the 3DGS steps have half or a quarter of the size."""
+    """A quarter of the steps after density control have half or a quarter of the size."""
     parameters = replace(METHODS[name].presets["draft"], full_resolution=0.5, far_share=0.25)
     method = create(name, data, parameters, 0, "cpu")
     steps = method.stages.ends[0] if name == "flod" else method.steps

@@ -132,7 +132,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         else:
             progress = self._progress(step)
         factor = shrink_at(progress, p.first_resolution, p.full_resolution)
-        if factor > 1 or self.is_finishing(step):
+        if factor > 1 or self.is_finishing(step) or self.stages.local_step(step) < self._densify_until(step):
             return factor
         return random_reduction(self.seed, self._skipped_steps + step, p.far_share)
 
