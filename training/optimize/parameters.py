@@ -188,7 +188,7 @@ class DensityParameters(Parameters):
     far_share: float = setting(
         0.25,
         "Fraction of the steps after density control that reduce their image by 2 or 4, as if seen from "
-        "farther away. Improves small images.",
+        "farther away, except the last tenth. Improves small images.",
         high=1,
     )
     long_axis: bool = setting(

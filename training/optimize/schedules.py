@@ -16,6 +16,9 @@ SMALL_SHARE = 0.25
 """Share of the steps that refine a merged level with reduced images. On full-size images alone, a level
 becomes worse than its merge at small sizes."""
 
+FAR_END = 0.9
+"""Share of the steps of a finest level after which all images have full size, for the finest details."""
+
 
 def log_linear(first: float, last: float, share: float) -> float:
     """Interpolate geometrically between two values; a ``share`` above 1 gives the last value."""

@@ -24,7 +24,7 @@ from .initialize import drop_duplicates, from_points, from_splats, sample_points
 from .method import Drawing, Method
 from .model import Model, splat_rates
 from .parameters import SplatParameters
-from .schedules import due, log_linear, random_reduction, shrink_at
+from .schedules import FAR_END, due, log_linear, random_reduction, shrink_at
 from .training_data import TrainingView
 
 PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
@@ -66,9 +66,8 @@ class SplatMethod(Method[SplatParameters, Drawing]):
     def shrink(self, step: int) -> float:
         p = self.parameters
         factor = shrink_at(step / self.scheduled_steps, p.first_resolution, p.full_resolution)
-        if factor > 1 or step < self._densify_until:
-            return factor
-        return random_reduction(self.seed, step, p.far_share)
+        may_be_far = self._densify_until <= step < FAR_END * self.scheduled_steps
+        return random_reduction(self.seed, step, p.far_share) if may_be_far and factor == 1 else factor
 
     def render_weights(self, view: TrainingView, step: int) -> tuple[torch.Tensor | None, float]:
         return self.dropout.weights(len(self.model), step, step / self.scheduled_steps), 0.0

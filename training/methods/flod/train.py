@@ -32,7 +32,7 @@ from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.refining import refining_rates
-from ...optimize.schedules import LevelStages, due, log_linear, random_reduction, shrink_at
+from ...optimize.schedules import FAR_END, LevelStages, due, log_linear, random_reduction, shrink_at
 from ...optimize.training_data import TrainingView
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
@@ -132,7 +132,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         else:
             progress = self._progress(step)
         factor = shrink_at(progress, p.first_resolution, p.full_resolution)
-        if factor > 1 or self.is_finishing(step) or self.stages.local_step(step) < self._densify_until(step):
+        local, end = self.stages.local_step(step), FAR_END * self.stages.steps_at(step)
+        if factor > 1 or self.is_finishing(step) or not self._densify_until(step) <= local < end:
             return factor
         return random_reduction(self.seed, self._skipped_steps + step, p.far_share)
 
