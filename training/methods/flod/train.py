@@ -60,7 +60,7 @@ class Method(method.Method[FlodParameters, Drawing]):
         self.stages = LevelStages(p.stages)
         self.merged = MergedLevels(self.stages, data, p, self.seed, self.backend)
         points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
-        self.points, self.colors = sample_points(points, colors, p.splat_limit, self.seed)
+        self.points, self.colors = sample_points(points, colors, p.growth_limit(p.splat_limit), self.seed)
         self.completed: dict[int, Mapping[str, torch.Tensor]] = {}
         self.levels = p.levels
         if p.levels > 1:
@@ -278,7 +278,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             # overlap pruning now allows half of a smaller size
             distances, _ = KDTree(tensors["means"].cpu().numpy()).query(self.points)
             free = np.flatnonzero(distances >= new_min / 2)
-            room = max(self.budget(level) - len(tensors["means"]), 0)
+            room = max(self.parameters.growth_limit(self.budget(level)) - len(tensors["means"]), 0)
             if len(free) > room:
                 rng = np.random.default_rng([self.seed, level, 2])
                 free = np.sort(rng.choice(free, room, replace=False))
