@@ -15,8 +15,8 @@ class OctreeParameters(Parameters):
 
     max_splats: int = setting(
         90_000,
-        "Maximum number of splats of all levels together; levels add up. The five levels of FLoD have "
-        "over 110,000. 0 is unlimited.",
+        "Maximum number of splats of all levels of the octree together, which are the finest level if "
+        "coarser levels are merged from it. 0 is unlimited.",
     )
     grad_threshold: float = setting(
         5e-5, "Mean image-plane gradient (3DGS units) above which anchors grow, at one megapixel."
