@@ -54,7 +54,7 @@ def describe(path: str | Path) -> str:
     )
     names = sorted({name for level in bundle.levels for name in level.facts})
     lines = [
-        f"{path}: {bundle.method or 'plain 3DGS PLY'}, {count} level{'s'[: count > 1]}, "
+        f"{path}: {bundle.method or 'plain splats'}, {count} level{'s'[: count > 1]}, "
         f"{_completeness(bundle)}, SH degree {bundle.levels[0].sh_degree}",
         f"levels selected by the rule {bundle.rule}" if bundle.rule else "no selection by camera distance",
         f"bounds  ({low}) to ({high})",

@@ -514,4 +514,4 @@ def test_info_describes_bundle_folder_and_ply(tmp_path, bundle):
     write_folder(tmp_path / "f", bundle)
     assert describe(tmp_path / "f").splitlines()[4].split()[:2] == ["1", "3"]
     write_ply(tmp_path / "plain.ply", bundle.levels[0].splats)
-    assert "plain 3DGS PLY, 1 level," in describe(tmp_path / "plain.ply")
+    assert "plain splats, 1 level," in describe(tmp_path / "plain.ply")
