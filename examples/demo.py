@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tools.blender_module import EXTENSION, start_blender  # noqa: E402
+from tools.viewer import fetch  # noqa: E402
 from training.__main__ import main as lodgs  # noqa: E402
 from training.methods import METHODS  # noqa: E402
 from training.runs.folder import RunFolder  # noqa: E402
@@ -66,7 +67,8 @@ def main() -> int:
     print("  index.html   compare the levels in a browser: open this next")
     print("  scene.blend  the scene in Blender, with levels by distance")
     print("  bundle.ply   all levels in one file, which ordinary viewers open at the finest")
-    print("  page         all levels for any browser, to upload; python -m http.server shows it here")
+    if (out / "page").exists():
+        print("  page         all levels for any browser, to upload; python -m http.server shows it here")
     print("  levels.png   comparison of the levels; report.json has the numbers")
     if run.costs.exists():
         print(f"In {os.path.relpath(run.path)}: costs.png (costs measured to choose the levels' distances)")
@@ -88,9 +90,10 @@ def write_report(scene: Path, run: RunFolder, out: Path) -> int:
     shutil.copy2(run.sheet, out / "levels.png")
     title = scene.resolve().name.replace("_", " ").capitalize()
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
-        return lodgs(["compare", str(run.path), "--out", str(out)]) or lodgs(
-            ["page", str(run.path), "--out", str(out / "page"), "--title", title]
-        )
+        code = lodgs(["compare", str(run.path), "--out", str(out)])
+        if code or not fetch():  # without network there is no viewer, and no page
+            return code
+        return lodgs(["page", str(run.path), "--out", str(out / "page"), "--title", title])
 
 
 def _splat_count_row(row: dict) -> dict:
