@@ -8,7 +8,6 @@ folder/  images/view_0001.png    rendered image
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LodgsError, system_reason
+from ..files import atomic_folder, temporary_folder
 from .cameras import MAX_COORDINATE, Camera, read_camera_folder
 from .colmap import DEPTHS
 from .exr import read_parts
@@ -104,18 +104,15 @@ def write_rendered_model(
         depth = read_exr_depth(depth_files[number])
         return depth if sky is None else sky.fill_depth(views[number], depth)
 
-    temporary = folder / ".model.tmp"
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        count = write_visible_points(temporary, views, depth_of, points, 255 * colors)
-        shutil.rmtree(folder / "sparse", ignore_errors=True)
-        (temporary / "sparse").rename(folder / "sparse")
+        with temporary_folder(folder) as temporary:
+            count = write_visible_points(temporary, views, depth_of, points, 255 * colors)
+            with atomic_folder(folder / "sparse") as sparse:
+                (temporary / "sparse" / "0").rename(sparse / "0")
     except OSError as error:
         raise LodgsError(
             f"Cannot write the model in {folder}: {system_reason(error)}.", "Free disk space."
         ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return len(views), count
 
 

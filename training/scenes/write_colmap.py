@@ -111,10 +111,10 @@ def write_model(
     colors: np.ndarray,
     observations: Sequence[tuple[np.ndarray, np.ndarray]] = (),
 ) -> None:
-    """Write a binary model completely or not at all. An existing model is replaced.
+    """Write a binary model completely or not at all.
 
     Args:
-        model: folder of the model.
+        model: new folder.
         lenses: lens of each view.
         poses: name and world_to_camera (4, 4) of each view.
         points: (P, 3) positions.
@@ -123,7 +123,7 @@ def write_model(
             points without tracks.
 
     Raises:
-        OSError: if a file cannot be written.
+        OSError: if a file cannot be written, or the folder exists and is not empty.
     """
     observations = observations or [(np.zeros(0, np.int64), np.zeros((0, 2)))] * len(poses)
     camera_ids: dict[bytes, int] = {}
@@ -158,7 +158,6 @@ def write_model(
                 stream.writelines([struct.pack("<Q", count), *records])
                 stream.flush()
                 os.fsync(stream.fileno())  # some disks report only now that they are full
-        shutil.rmtree(model, ignore_errors=True)
         os.replace(temporary, model)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

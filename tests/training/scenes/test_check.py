@@ -117,6 +117,7 @@ def rewrite(folder, pose=np.array, pixels=np.array, lens=None, tracks=True):
     scene = read_scene(GARDEN)
     names = [camera.name for camera in scene.cameras]
     observed = observed_pixels(scene, names)
+    shutil.rmtree(folder / "sparse", ignore_errors=True)
     write_model(
         folder / "sparse" / "0",
         [lens] * len(names) if lens else scene_lenses(scene),

@@ -1,6 +1,8 @@
 """COLMAP scenes from rendered views: an analytic ball on the ground, in files like Blender's."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -121,6 +123,22 @@ def test_model_is_replaced(tmp_path):
     assert views_count == 6 and count <= 200 < default_count
     assert len(read_scene(tmp_path).points) == count
     assert {path.name for path in tmp_path.iterdir()} == {"cameras", "depths", "images", "sparse"}
+
+
+def test_interrupted_replacement_keeps_the_model(tmp_path, monkeypatch):
+    write_views(tmp_path, views())
+    _, count = write_rendered_model(tmp_path)
+    rename = os.rename
+
+    def interrupt(source, target):
+        if Path(source).name in ("sparse", "new"):
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_rendered_model(tmp_path, limit=200)
+    assert len(read_scene(tmp_path).points) == count
 
 
 def test_transparent_pixels_give_no_sky(tmp_path):
