@@ -99,12 +99,15 @@ def export_finest_level(path: Path, bundle: Bundle, options: FileOptions = DEFAU
     except in formats that record the filter.
 
     Raises:
-        LodgsError: see :func:`..splats.formats.write_splats`, or the format has no double precision.
+        LodgsError: see :func:`..splats.formats.write_splats`, the level has no splats, or the format has no
+            double precision.
     """
     origin = bundle.origin if options.original_place else NO_ORIGIN
     kind = find_format(path)
+    rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
+    if not len(rows):
+        raise LodgsError(f"Cannot write {path}: the finest level has no splats.", "Make some splats visible.")
     if kind.write_levels is not None:
-        rows = ConcatenatedRows.of_level(bundle, bundle.levels[-1].number)
         finest = replace(bundle, levels=[Level(1, NO_SPLATS, on_disk=rows)], rule="", cumulative=False)
         export_levels(path, finest, options)
         return

@@ -12,7 +12,7 @@ import pytest
 
 from tests.checkout import copy_checkout, recipe_code
 from training.__main__ import main
-from training.editing.export import export_levels
+from training.editing.export import export_finest_level, export_levels
 from training.errors import LodgsError
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.compressed_ply import read_compressed_ply, write_compressed_ply
@@ -26,7 +26,7 @@ from training.splats.formats import (
 from training.splats.formats.splat import SplatFile, write_splat
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.level_folder import read_folder
-from training.splats.levels import Bundle, Level
+from training.splats.levels import NO_SPLATS, Bundle, Level
 from training.splats.ply import read_ply, write_ply
 from training.splats.splat_format import NeedsTrainer
 from training.splats.streamed_levels import write_streamed_levels
@@ -281,6 +281,14 @@ def test_edit_command_writes_all_formats_alike(tmp_path, monkeypatch, capsys, cu
     assert np.array_equal(SplatFile(tmp_path / "one.splat").select(slice(None)).means, plain.means)
     assert np.array_equal(out.up_rotation, np.eye(3))
     assert main(["edit", "in.ply"]) == 2  # nothing to write
+
+
+@pytest.mark.parametrize("kind", FORMATS, ids=lambda kind: kind.suffix)
+def test_finest_level_without_splats_is_refused(tmp_path, kind):
+    bundle = Bundle("", [Level(1, random_splats(9)), Level(2, NO_SPLATS)])
+    with pytest.raises(LodgsError, match="the finest level has no splats"):
+        export_finest_level(tmp_path / f"a{kind.suffix}", bundle)
+    assert not list(tmp_path.iterdir())
 
 
 def test_recipe_adds_a_format_to_the_command_line(tmp_path):
