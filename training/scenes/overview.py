@@ -66,7 +66,7 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
     """Return center (3,) and radius of a ball around the subject of a scene.
 
     It holds nine tenths of the splats, or those within 2.5 times the median distance from the median position
-    if that is smaller, as in scenes with a far background.
+    if that is smaller, as in scenes with a far background. The radius is 1 if most splats are at one place.
 
     Args:
         means: (N, 3) finite positions, N > 0.
@@ -75,7 +75,7 @@ def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
     distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     median, ninth_decile = np.percentile(distances, (50, 90))
     near = means[is_near(means)]
-    return np.median(near, axis=0), float(max(min(ninth_decile, _FAR_FACTOR * median), 1e-9))
+    return np.median(near, axis=0), float(min(ninth_decile, _FAR_FACTOR * median)) or 1.0
 
 
 def is_near(means: np.ndarray) -> np.ndarray:

@@ -153,6 +153,14 @@ def test_floaters_are_small_clusters_of_touching_cells(seed):
     np.testing.assert_array_equal(find_floaters(means, 0.5, 0.02), naive_floaters(means, 0.5, 12))
 
 
+@pytest.mark.parametrize("count", [1, 5])
+def test_splats_at_one_place_are_no_clutter(count):
+    splats = some_splats(np.random.default_rng(0), count)
+    splats.means[:], splats.log_scales[:], splats.opacity_logits[:] = 3.0, -2.0, 1.0
+    bundle = clean_bundle(Bundle("", [Level(1, splats)]), Cleaning(clutter=True))
+    assert len(bundle.levels[0].splats) == count
+
+
 def test_far_and_unseen_use_every_camera():
     rng = np.random.default_rng(2)
     means = rng.normal(0, 5, (400, 3)).astype(np.float32)
