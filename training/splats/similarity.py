@@ -118,6 +118,7 @@ class Similarity:
         row = squares[np.argmax(np.diag(squares))]
         return row / np.linalg.norm(row)
 
+    @np.errstate(over="ignore", invalid="ignore")  # positions that are not finite stay so
     def transform_axes(self, axes: Iterable[np.ndarray], translate: bool = True) -> list[np.ndarray]:
         """Transform coordinates axis by axis; equal inputs give bit-identical outputs.
 

@@ -184,6 +184,16 @@ def test_positions_that_no_reader_accepts_are_not_written(tmp_path, capfd, optio
     assert not (tmp_path / "b.ply").exists()
 
 
+@pytest.mark.filterwarnings("error")
+def test_infinite_positions_of_columns_give_no_warning():
+    bundle, _ = tree_bundle(0)
+    columns = bundle.levels[0].splats.extras
+    columns["parent_x"][:] = np.inf
+    columns["nx"] = columns["ny"] = columns["nz"] = columns["parent_x"]
+    moved = transform_bundle(bundle, Similarity.from_angles((10, 20, 30), 1.0, (1, 2, 3)))
+    assert np.isfinite(moved.levels[0].splats.means).all()
+
+
 def test_unknown_rule_is_rejected():
     bundle = Bundle("new", [Level(1, surfaces(5))], "of tomorrow")
     with pytest.raises(LodgsError, match="of tomorrow"):

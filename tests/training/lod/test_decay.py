@@ -148,3 +148,18 @@ def test_only_the_finest_level_is_drawn():
     )
     assert len(coarse.splats) == 0 and len(fine.splats) == len(expected.splats) > 0
     np.testing.assert_array_equal(fine.weights, expected.weights)
+
+
+@pytest.mark.filterwarnings("error")
+def test_threshold_of_zero_gives_no_warning():
+    count = 3000
+    means, columns = scene(count)
+    values = {"s_v": 1.0, "at_most": count // 2}
+    weights = DECAY.weights(means, np.zeros(3), 500.0, columns, FACTS | {"tau": 0.0}, values)
+    assert 0 < np.count_nonzero(weights) <= count // 2
+    splats = Splats(
+        means, np.tile(np.float32([1, 0, 0, 0]), (count, 1)), np.zeros((count, 3), np.float32),
+        np.zeros(count, np.float32), np.zeros((count, 1, 3), np.float32), {"sigma_d": columns["sigma_d"]},
+    )  # fmt: skip
+    bundle = Bundle("clod", [Level(1, splats)], "decay", {"reference": 8.0, "tau": 0.0})
+    assert all(np.isfinite(level.facts["d_l"]) for level in DECAY.nested_levels(bundle).levels)

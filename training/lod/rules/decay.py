@@ -27,6 +27,8 @@ EPSILON = 1e-8
 """The paper's ε."""
 LIMIT_MARGIN = 1e-5
 """Relative margin on the virtual scale of a budget, so that rounding does not exceed the budget."""
+MIN_TAU = 1e-9
+"""Smallest threshold; that of a damaged file may be 0."""
 NEWTON_STEPS = 6
 """Newton steps of :func:`max_visible_scale`; each doubles the number of correct digits."""
 
@@ -108,7 +110,7 @@ class Decay(Rule):
     def weights(self, means, position, focal_px, columns, facts, values, tables=NO_TABLES) -> np.ndarray:
         if facts["level"] < facts["levels"]:
             return np.zeros(len(means), np.float32)
-        tau = facts["tau"]
+        tau = max(facts["tau"], MIN_TAU)
         normalized = self.normalized(means, position, facts)
         s_v = self.virtual_scale(normalized, columns, tau, values)
         weight = attenuation(normalized, columns[SIGMA], s_v).astype(np.float32)
@@ -130,7 +132,7 @@ class Decay(Rule):
             distances(splats.means, np.median(splats.means, axis=0)).max(initial=1e-20)
         )
         # α·attenuation = τ s_v, solved for the normalised distance d′
-        logarithm = np.log(np.maximum(opacity / (facts["tau"] * s_v), 1))
+        logarithm = np.log(np.maximum(opacity / (max(facts["tau"], MIN_TAU) * s_v), 1))
         reach = np.sqrt((2 * sigma.clip(0) ** 2 + EPSILON) * logarithm) / s_v
         order = np.argsort(-reach, kind="stable")
         splats.extras = {name: x for name, x in splats.extras.items() if name != SIGMA}
