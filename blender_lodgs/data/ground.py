@@ -14,7 +14,7 @@ from ...training.scenes.ground import (
     scaling_about,
 )
 from ..attributes import BASE, read_attribute
-from .metadata import read_json
+from .metadata import meta_of
 from .photographs import views
 from .placement import axes_of, move, placement_of
 
@@ -140,7 +140,7 @@ def ground_points(root: bpy.types.Object) -> np.ndarray:
             base = read_attribute(obj.data, BASE)
             parts.append(positions if base is None else positions[base[:, 3] > 0.5])
     positions = np.concatenate(parts)
-    depth = root.lodgs.training.median_depth or read_json(root.lodgs.meta).get("median_depth", 0)
+    depth = root.lodgs.training.median_depth or meta_of(root).get("median_depth", 0)
     return points_near_cameras(
         positions, np.array(root.lodgs.camera_center), depth if isinstance(depth, int | float) else 0
     )

@@ -7,6 +7,7 @@ import json
 import bpy
 import numpy as np
 
+from ...training.splats.bundle_header import INCONSISTENCIES, check_meta
 from ...training.splats.levels import Bundle
 
 
@@ -20,9 +21,19 @@ def read_json(text: str) -> dict:
     return content if isinstance(content, dict) else {}
 
 
+def meta_of(root: bpy.types.Object) -> dict:
+    """Return the meta of a splat scene's bundle; {} if a damaged file has an invalid one."""
+    meta = read_json(root.lodgs.meta)
+    try:
+        check_meta(meta)
+    except INCONSISTENCIES:
+        return {}
+    return meta
+
+
 def origin_of(root: bpy.types.Object) -> np.ndarray:
     """Return the local origin of a splat scene, (3,) float64 (``training.splats.origin``)."""
-    return Bundle("", [], meta=read_json(root.lodgs.meta)).origin
+    return Bundle("", [], meta=meta_of(root)).origin
 
 
 def read_facts(text: str) -> dict[str, float]:

@@ -150,7 +150,7 @@ def is_held_out(root: bpy.types.Object, view: bpy.types.Object) -> bool:
     settings = view.data.lodgs
     if settings.is_property_set("held_out"):
         return settings.held_out
-    match metadata.read_json(root.lodgs.meta).get("held_out"):
+    match metadata.meta_of(root).get("held_out"):
         case [*rests, int(every)] if every > 0:
             return settings.model_index % every in rests
     return False
@@ -280,7 +280,7 @@ def photo_viewpoint(root: bpy.types.Object) -> tuple[Vector, Vector] | None:
     They come from the bundle, or from the most central view and the median depth of the points. None without
     both.
     """
-    meta = metadata.read_json(root.lodgs.meta)
+    meta = metadata.meta_of(root)
     if "view" in meta:
         position, target = (matrix_in_world(root) @ Vector(point) for point in meta["view"])
         return position, target

@@ -169,7 +169,7 @@ def read_levels(root: bpy.types.Object, placed: bool = False, looked: bool = Fal
             f"Cannot read the levels of '{root.name}': it has no levels.", "Train it or import splats first."
         )
     settings = root.lodgs
-    facts, meta = metadata.read_facts(settings.facts), metadata.read_json(settings.meta)
+    facts, meta = metadata.read_facts(settings.facts), metadata.meta_of(root)
     bundle = Bundle(
         settings.method, levels, settings.rule, facts, changed_controls(root), settings.cumulative, meta,
         tables.read_tables(root) | view_tables(root),

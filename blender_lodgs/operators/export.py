@@ -282,7 +282,7 @@ class LODGS_OT_export_plain(_FormatExport, bpy.types.Operator):
         else:
             splats = scenes.visible_splats(context, root, self.placed, self.looked)
         path = self._path()
-        meta = metadata.read_json(root.lodgs.meta)
+        meta = metadata.meta_of(root)
         if self.placed:  # in Blender's coordinates, only these remain true
             meta = {name: meta[name] for name in ("antialias", "focal_px") if name in meta}
             meta["up_rotation"] = np.eye(3).tolist()

@@ -32,7 +32,7 @@ class LODGS_PT_costs(LevelsPanel):
 
 def _lines(context: bpy.types.Context, root: bpy.types.Object) -> list[str]:
     """Return one line per level: its distance in Blender units and its rendering cost."""
-    meta = metadata.read_json(root.lodgs.meta)
+    meta = metadata.meta_of(root)
     return cost_lines(meta, lambda value: scene_length(context, root, value))
 
 

@@ -119,7 +119,7 @@ def parse_bundle(head: dict, lines: list[dict], meta: dict, path: str | Path) ->
         )
     if version < FORMAT_VERSION:
         raise ValueError(f"version {version} is not supported")
-    _check_meta(meta)
+    check_meta(meta)
     if not 1 <= len(check_type(lines, list, "levels")) <= MAX_READ_LEVELS:
         raise ValueError(f"{len(lines)} levels")
     for line in lines:
@@ -160,7 +160,8 @@ def check_type(value: Kind, kind: type[Kind], name: str) -> Kind:
     return value
 
 
-def _check_meta(meta: dict) -> None:
+def check_meta(meta: dict) -> None:
+    """Raise one of :data:`INCONSISTENCIES` if an entry of meta has an invalid value."""
     check_type(meta, dict, "meta")
     for name, shape in META_SHAPES.items():
         if name in meta:

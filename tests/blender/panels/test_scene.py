@@ -341,3 +341,11 @@ def test_panel_shows_the_local_origin(bpy, lodgs, draw_panel, tmp_path):
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats(9))], meta=meta))
     lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
     assert "Local origin 500000  4200000  300.5" in " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
+
+
+@pytest.mark.parametrize("meta", ['{"origin": "a"}', '{"view": [1]}', '{"georeference": 1}'])
+def test_damaged_meta_is_ignored(bpy, lodgs, root, draw_panel, meta):
+    root.lodgs.meta = meta
+    assert "Local origin" not in " ".join(draw_panel("scene", "LODGS_PT_scene").texts)
+    lodgs("data.photographs").look_at_scene(bpy.context, root)
+    assert lodgs("data.scenes").read_levels(root).meta == {}
