@@ -63,10 +63,11 @@ def region_object(root: bpy.types.Object, region: Crop) -> bpy.types.Object:
 def evaluated_crops(root: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[Crop, ...]:
     """Return the enabled crops in the splats' space, as evaluated in the depsgraph."""
     from_world = world_matrix(axes_of(root), depsgraph).inverted_safe()
+    settings = {obj: obj.evaluated_get(depsgraph).lodgs_crop for obj in crops_of(root)}
     return tuple(
         evaluated_crop(obj, from_world, depsgraph)
-        for obj in removing_crops(root)
-        if obj.evaluated_get(depsgraph).lodgs_crop.use
+        for obj, crop in settings.items()
+        if crop.use and crop.keep != "ALL"
     )
 
 
@@ -105,12 +106,12 @@ def modifier_crops(
         return None
     from_world, crops = evaluated.matrix_world.inverted_safe(), []
     for number in range(1, count + 1):
-        obj, size, sphere, outside, use = (
+        obj, size, sphere, side, use = (
             compat.get_input(modifier, name.format(number))
             for name in (groups.OBJECT, groups.SIZE, groups.SPHERE, groups.OUTSIDE, groups.USE)
         )
-        if use and obj is not None:
-            crops.append(_crop(from_world, obj, depsgraph, size, sphere > 0.5, outside > 0.5))
+        if use and obj is not None and side < 1.5:
+            crops.append(_crop(from_world, obj, depsgraph, size, sphere > 0.5, side > 0.5))
     return tuple(crops)
 
 

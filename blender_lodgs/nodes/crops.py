@@ -18,13 +18,14 @@ NAME = "LODGS Clean Up"
 OBJECT, SIZE, SPHERE, OUTSIDE, USE = "crop_{}", "size_{}", "sphere_{}", "outside_{}", "use_{}"
 """Sockets of each crop, numbered from 1: object, radius or half edge length, and three flags (1 or 0).
 
-The flags select a sphere instead of a box, remove the inside instead of the outside, and enable the crop.
+The flags select a sphere instead of a box, remove the inside instead of the outside, and enable the crop. The
+second one is 2 in frames in which the crop removes nothing.
 """
 _SOCKETS = {
     OBJECT: "NodeSocketObject", SIZE: "NodeSocketFloat", SPHERE: "NodeSocketFloat",
     OUTSIDE: "NodeSocketFloat", USE: "NodeSocketFloat",
 }  # fmt: skip
-_VERSION = 2
+_VERSION = 3
 MATERIAL = "material"
 
 
@@ -67,9 +68,9 @@ def _keep_mask(nodes: Nodes, sockets, count: int) -> Field:
     inside: Field | None = None
     no_keep_crop: Field | None = None  # 1 if no enabled crop keeps its inside
     for number in range(1, count + 1):
-        enabled, removes = (nodes.field(sockets[name.format(number)]) for name in (USE, OUTSIDE))
+        enabled, side = (nodes.field(sockets[name.format(number)]) for name in (USE, OUTSIDE))
         in_crop = inside_crop(nodes, sockets, number, position) & enabled
-        keeps = enabled * (1.0 - removes)
+        keeps, removes = enabled & (side < 0.5), (side > 0.5) & (side < 1.5)
         inside = in_crop * keeps if inside is None else inside.maximum(in_crop * keeps)
         no_keep_crop = 1.0 - keeps if no_keep_crop is None else no_keep_crop * (1.0 - keeps)
         keep = keep * (1.0 - in_crop * removes)

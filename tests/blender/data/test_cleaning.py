@@ -443,6 +443,28 @@ def test_points_on_a_crop_face_are_inside(bpy, lodgs, scene_of, shape):
         np.testing.assert_array_equal(np.flatnonzero(crops[0].contains(level.splats.means)), on_face)
 
 
+def test_animated_crops_remove_nothing_while_they_keep_all(bpy, lodgs, scene_of, monkeypatch):
+    root, bundle = scene_of(bundle_of("bands", np.random.default_rng(9)))
+    root.lodgs.mode, level = "SINGLE", root.lodgs.levels[2]
+    root.lodgs.single_level = 3
+    bpy.ops.lodgs.add_crop(shape="BOX")
+    crop, crops = bpy.context.active_object, lodgs("data.crops")
+    for frame, keep in ((1, "ALL"), (2, "INSIDE")):
+        crop.lodgs_crop.keep = keep
+        crop.keyframe_insert("lodgs_crop.keep", frame=frame)
+    counts = []
+    # as in renders, whose depsgraph keeps the modifiers of another frame
+    monkeypatch.setattr(lodgs("data.selection"), "follow_crops", lambda root: None)
+    for frame in (2, 1):
+        bpy.context.scene.frame_set(frame)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        evaluated = level.object.evaluated_get(depsgraph)
+        cropped = crops.modifier_crops(evaluated, depsgraph, lambda modifier: True)
+        assert len(cropped) == len(crops.evaluated_crops(root, depsgraph)) == frame - 1
+        counts.append(len(shown_rows(bpy, lodgs, level.object)))
+    assert counts[0] < counts[1] == len(bundle.levels[2].splats)
+
+
 def test_crops_of_older_files_get_the_current_group(bpy, lodgs, scene_of):
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(7)))
     bpy.ops.lodgs.add_crop(shape="BOX")
