@@ -5,8 +5,9 @@ from __future__ import annotations
 import bpy
 
 from ..attributes import BASE, LOG_SCALE, rename_sh
-from ..nodes import display
+from ..nodes import display, ellipsoids
 from . import looks, selection
+from .roots import roots
 
 
 def repair_references(group: bpy.types.PropertyGroup) -> None:
@@ -48,9 +49,18 @@ def upgrade_scene(root: bpy.types.Object) -> None:
         selection.attach(root)
 
 
+def _restore_ellipsoids() -> None:
+    """Add the modifiers of ellipsoids that Blender does not save, because their objects are linked."""
+    for scene in bpy.data.scenes:
+        for root in roots(scene) if scene.lodgs_render.ellipsoids else ():
+            for item in root.lodgs.existing_levels:
+                if not item.object.is_editable:
+                    ellipsoids.attach(item.object)
+
+
 @bpy.app.handlers.persistent
 def _on_load(*_) -> None:
-    """Upgrade editable data after a file is opened or appended from; linked data stay unchanged."""
+    """Upgrade editable data after a file is opened or appended from; linked data only get ellipsoids."""
     for cloud in bpy.data.pointclouds:
         if cloud.is_editable and BASE in cloud.attributes:
             rename_sh(cloud)
@@ -65,6 +75,7 @@ def _on_load(*_) -> None:
     for obj in bpy.data.objects:
         if obj.lodgs.is_root and obj.is_editable:
             upgrade_scene(obj)
+    _restore_ellipsoids()
 
 
 def _restore_drivers() -> None:

@@ -128,6 +128,19 @@ def test_ellipsoids_are_on_only_if_enabled(bpy, lodgs, scene):
     assert bpy.data.objects["one level 2"].modifiers[-1].name == "LODGS Ellipsoids"
 
 
+def test_linked_scenes_keep_ellipsoids_when_a_file_is_opened(bpy, lodgs, scene, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, linked):
+        linked.collections = ["one"]
+    bpy.context.scene.collection.children.link(linked.collections[0])
+    bpy.context.scene.lodgs_render.ellipsoids = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "file.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "file.blend"))
+    modifiers = bpy.context.scene.objects["one level 1"].modifiers
+    assert [modifier.name for modifier in modifiers].count("LODGS Ellipsoids") == 1
+
+
 def test_ellipsoids_end_at_an_alpha_of_one_percent(bpy, lodgs, scene):
     """At d standard deviations alpha is opacity * exp(-d²/2); fainter splats have no ellipsoid."""
     opacities = np.array([0.9, 0.3, 0.05, 0.005])
