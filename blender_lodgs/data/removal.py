@@ -2,7 +2,8 @@
 
 Blender deletes only the empty and leaves cameras, hidden points and levels behind, with drivers that read
 deleted properties. A root therefore references itself (``root.lodgs.itself``): a deleted root keeps its data
-until :func:`remove` deletes the entire scene.
+until :func:`remove` deletes the entire scene. A root that was appended with another object, such as a level
+by a script, has no collection either, but was not deleted (``root.lodgs.is_appended``).
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ def remove(root: bpy.types.Object) -> None:
 def remove_deleted() -> None:
     """Remove the splat scenes whose root an artist deleted."""
     for root in [obj for obj in bpy.data.objects if obj.lodgs.is_root and obj.is_editable]:
-        if root.lodgs.itself == root and not root.users_collection:
+        if root.users_collection:
+            root.lodgs.property_unset("is_appended")
+        elif root.lodgs.itself == root and not root.lodgs.is_appended:
             remove(root)
 
 
@@ -80,6 +83,13 @@ def _remove_soon(*_) -> None:
 
 
 @bpy.app.handlers.persistent
+def _on_import(context, *_) -> None:
+    for item in context.import_items:
+        if isinstance(item.id, bpy.types.Object) and item.id.lodgs.is_root and item.id.is_editable:
+            item.id.lodgs.is_appended = not item.id.users_collection
+
+
+@bpy.app.handlers.persistent
 def _on_save(*_) -> None:
     remove_deleted()
 
@@ -88,6 +98,7 @@ def register() -> None:
     handlers = bpy.app.handlers
     handlers.depsgraph_update_post.append(_on_update)
     handlers.save_pre.append(_on_save)
+    handlers.blend_import_post.append(_on_import)
     for callbacks in (handlers.load_post, handlers.undo_post, handlers.redo_post):
         callbacks.append(_remove_soon)
 
@@ -96,6 +107,7 @@ def unregister() -> None:
     handlers = bpy.app.handlers
     handlers.depsgraph_update_post.remove(_on_update)
     handlers.save_pre.remove(_on_save)
+    handlers.blend_import_post.remove(_on_import)
     for callbacks in (handlers.load_post, handlers.undo_post, handlers.redo_post):
         callbacks.remove(_remove_soon)
     if bpy.app.timers.is_registered(remove_deleted):

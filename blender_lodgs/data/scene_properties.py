@@ -221,6 +221,11 @@ class SplatScene(bpy.types.PropertyGroup):
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
+    is_appended: bpy.props.BoolProperty(
+        name="Appended",
+        description="The root was appended with another object, and has no collection yet",
+        options={"HIDDEN"},
+    )
     flight_of: bpy.props.PointerProperty(
         name="Path of",
         description="Root of the scene that this camera path or turntable belongs to",

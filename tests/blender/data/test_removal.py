@@ -154,3 +154,21 @@ def test_animated_cameras_are_removed_with_their_scene(bpy, lodgs, root):
     assert len(added) == 3
     lodgs("data.removal").remove(root)
     assert data_names(bpy)["objects"] == ["user object"] and bpy.context.scene.camera is None
+
+
+def test_level_that_is_appended_alone_is_kept(bpy, lodgs, root, tmp_path):
+    name, level = root.name, root.lodgs.levels[1].object.name
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=False) as (_, appended):
+        appended.objects = [level]
+    bpy.context.scene.collection.objects.link(appended.objects[0])
+    for file in ("a.blend", "b.blend"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / file))  # removes deleted scenes
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / file))
+        assert level in bpy.context.scene.objects and all_drivers_valid(bpy)
+    objects, root = bpy.context.scene.collection.objects, bpy.data.objects[name]
+    for change in (objects.link, objects.unlink):  # without a collection again, it is deleted
+        change(root)
+        lodgs("data.removal").remove_deleted()
+    assert level not in bpy.data.objects
