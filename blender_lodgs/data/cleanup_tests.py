@@ -213,8 +213,7 @@ def suggest_limits(context: bpy.types.Context, root: bpy.types.Object) -> dict[s
 def suggest_clutter_limits(root: bpy.types.Object) -> dict[str, float]:
     """Suggest limits for *Find Clutter* from the size of the subject, as lengths in the world."""
     unit, limits = cleaning.unit_length(root), subject_of(root).limits()
-    means = cleaning.splat_attribute(root.lodgs.existing_levels[-1].object.data, "position")
-    return {"gap": default_gap(means) * unit} | {
+    return {"gap": default_gap(_finest_means(root)) * unit} | {
         limit_property(name): value * (unit if LIMITS[name].metadata["unit"] == "length" else 1)
         for name, value in limits.items()
     }
@@ -235,9 +234,13 @@ def subject_of(root: bpy.types.Object) -> clutter.SceneSubject:
     states = [(cloud.session_uid, len(cloud.points), changes.version(cloud)) for cloud in clouds]
     key = tuple(states), tuple(up)
     if not _subject or _subject[0] != key:
-        means = np.concatenate([cleaning.splat_attribute(cloud, "position") for cloud in clouds])
-        _subject[:] = [key, clutter.find_subject(means, up, ground_points(root))]
+        _subject[:] = [key, clutter.find_subject(_finest_means(root), up, ground_points(root))]
     return _subject[1]
+
+
+def _finest_means(root: bpy.types.Object) -> np.ndarray:
+    """Return the means (N, 3) of all splats that the finest level shows."""
+    return np.concatenate([cleaning.splat_attribute(obj.data, "position") for obj in finest_levels(root)])
 
 
 _subject: list[Any] = []

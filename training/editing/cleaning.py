@@ -249,7 +249,7 @@ def clean_bundle(bundle: Bundle, cleaning: Cleaning) -> Bundle:
 
 
 def find_unwanted(bundle: Bundle, cleaning: Cleaning) -> Unwanted:
-    """Apply all tests to a bundle's splats. Reads each level once, the finest one twice for clutter."""
+    """Apply all tests to a bundle's splats. Reads each level once, those of the subject twice."""
     cleaning = cleaning.for_bundle(bundle)
     related = resolve_rule(bundle.rule).relations
     matches: dict[str, dict[int, np.ndarray]] = {}

@@ -7,7 +7,7 @@ import pytest
 
 from training.splats.bundle import write_bundle
 from training.splats.gaussians import Splats
-from training.splats.levels import Bundle, Level
+from training.splats.levels import NO_SPLATS, Bundle, Level
 
 COUNTS = REST, OVERSIZED, DISTANT, FLOATERS, BELOW, HALOS = 6000, 5, 6, 4, 8, 3
 
@@ -172,6 +172,13 @@ def test_levels_without_splats_are_reported(bpy, lodgs, root, operator):
     root.lodgs.levels[-1].object.data = cloud
     with pytest.raises(RuntimeError, match=r"^Error: Cannot (measure|find clutter)"):
         getattr(bpy.ops.lodgs, operator)()
+
+
+def test_clutter_of_levels_that_add_up_without_finest_splats(bpy, lodgs, root):
+    root.lodgs.cumulative = True
+    lodgs("data.scenes").set_level(root, Level(3, NO_SPLATS))
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
+    assert root.lodgs_clutter.gap > 0
 
 
 def test_crops_of_scenes_that_the_view_layer_excludes(bpy, lodgs, root):
