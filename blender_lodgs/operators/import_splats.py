@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -64,9 +65,13 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def paths(self) -> list[Path]:
-        """Return the chosen or dropped files."""
-        paths = [Path(self.directory, file.name) for file in self.files if file.name]
-        return paths or [Path(self.filepath)]
+        """Return the chosen or dropped files.
+
+        Raises:
+            LodgsError: a path names a device.
+        """
+        paths = [os.path.join(self.directory, file.name) for file in self.files if file.name]
+        return [absolute_path(path) for path in paths or [self.filepath]]
 
     def work(self, context):
         def warn(message: str) -> None:
@@ -77,7 +82,7 @@ class LODGS_OT_import_splats(BackgroundOperator, bpy.types.Operator):
         self._imported = imported = []
         try:
             for path in self.paths():
-                read = reader.submit(importing.splats_reader(absolute_path(str(path)), self.budget, stop))
+                read = reader.submit(importing.splats_reader(path, self.budget, stop))
                 while self._modal and not read.done():
                     yield
                 root = yield from importing.place_splats(context, read.result(), self.upright, warn)

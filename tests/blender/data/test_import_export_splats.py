@@ -127,6 +127,17 @@ def test_several_dropped_files_import(bpy, lodgs, bundle, tmp_path):
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "plain2.ply").read_bytes()
 
 
+def test_relative_paths_of_scripts_are_those_of_the_file(bpy, lodgs, tmp_path):
+    """Path would turn "//" to a backslash on Windows."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "file.blend"))
+    operator = lodgs("operators.import_splats").LODGS_OT_import_splats
+    for options in (
+        {"filepath": "//a.ply", "directory": "", "files": []},
+        {"filepath": "", "directory": "//", "files": [SimpleNamespace(name="a.ply")]},
+    ):
+        assert operator.paths(SimpleNamespace(**options)) == [tmp_path / "a.ply"]
+
+
 def test_foreign_2d_filter_round_trip(bpy, lodgs, bundle, tmp_path):
     splats = bundle.levels[0].splats
     lodgs("training.splats.ply").write_ply(tmp_path / "mip.ply", splats, ["SplatRenderMode: mip"])
