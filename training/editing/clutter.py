@@ -113,7 +113,12 @@ def subject_of(bundle: Bundle) -> SceneSubject:
     batches = [(splats.means, splats.opacity_logits > 0) for splats in read_batches(rows)]
     means = np.concatenate([part for part, _ in batches])
     opaque = means[np.concatenate([part for _, part in batches])]
+    return find_subject(means, bundle.up_rotation[2], near_cameras(opaque, bundle))
+
+
+def near_cameras(points: np.ndarray, bundle: Bundle) -> np.ndarray:
+    """Return the points (P, 3) near the cameras of a bundle, for ground detection; all without cameras."""
     center, depth = bundle.meta.get("camera_center"), bundle.meta.get("median_depth", 0)
-    if center is not None and isinstance(depth, int | float):
-        opaque = points_near_cameras(opaque, np.asarray(center), depth)
-    return find_subject(means, bundle.up_rotation[2], opaque)
+    if center is None or not isinstance(depth, int | float):
+        return points
+    return points_near_cameras(points, np.asarray(center), depth)

@@ -12,7 +12,7 @@ from ..lod.blocks import BLOCKS, block_table
 from ..lod.rule import find_rule
 from ..lod.selection import unknown_rule_error
 from ..scenes import view_tables
-from ..scenes.ground import find_ground, ground_placement, points_near_cameras
+from ..scenes.ground import find_ground, ground_placement
 from ..splats.dialects import MAX_COORDINATE
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.georeference import Georeference
@@ -21,6 +21,7 @@ from ..splats.ply import read_batches
 from ..splats.portable_levels import ConcatenatedRows
 from ..splats.similarity import Similarity, TransformedRows
 from .cleaning import read_relations
+from .clutter import near_cameras
 
 
 def transform_bundle(bundle: Bundle, placement: Similarity) -> Bundle:
@@ -94,12 +95,9 @@ def upright_placement(
         return rotation
     if points is None:
         points = _opaque_means(ConcatenatedRows.of_level(bundle, bundle.levels[-1].number))
-    center = bundle.meta.get("camera_center")
-    depth = bundle.meta.get("median_depth", 0)
-    if center is not None and isinstance(depth, int | float):
-        points = points_near_cameras(points, np.asarray(center), depth)
+    near = near_cameras(points, bundle)
     try:
-        plane = find_ground(rotation.transform_points(points), np.array([0.0, 0.0, 1.0]))
+        plane = find_ground(rotation.transform_points(near), np.array([0.0, 0.0, 1.0]))
     except LodgsError as error:
         raise LodgsError(
             error.what, "Add the photos' folder with --scene, or use --rotate and --translate instead."
