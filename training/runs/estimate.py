@@ -119,7 +119,8 @@ def estimate(job: Job, scratch: Path) -> Estimate:
         torch.cuda.reset_peak_memory_stats()
     reset_peak_memory()
     grown = _with_points(scene, max(splats, MIN_POINTS))
-    late, growing, data = _measure(job, parameters, grown, backend, scratch, last=True)
+    all_points = replace(parameters, margin=0.0)  # margins are among the final splats
+    late, growing, data = _measure(job, all_points, grown, backend, scratch, last=True)
     width, height = data.train[0].width, data.train[0].height
     photos = sum(TARGET_BYTES * camera.width * camera.height for camera in data.train)
     photos = max(min(photos, job.photo_memory * 10**6 or MAX_BYTES) - data.images.held_bytes, 0)
