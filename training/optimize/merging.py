@@ -147,7 +147,11 @@ def cheapest_pairs(moments: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndar
 
 
 def merge_errors(moments: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the errors of merging rows ``first`` with rows ``second``: areas, times an optical depth."""
+    """Return the errors of merging rows ``first`` (M,) with rows ``second`` (M,) of moments (N, 10 or more).
+
+    Returns:
+        (M,) float64: areas in squared scene units, times an optical depth.
+    """
     moments, errors = np.ascontiguousarray(moments), np.empty(len(first))
     run_parallel(_fill_errors, len(first), _GRAIN, moments, _log_areas(moments), first, second, errors)
     return errors
