@@ -118,8 +118,10 @@ def split_longest_axis(
     return children, (scales * shares).repeat(2, 1)
 
 
-def prune(model: Model, min_opacity: float) -> None:
-    """Remove splats below an opacity."""
+def prune(model: Model, min_opacity: float, decay: float = 0.0) -> None:
+    """Reduce all opacities by a share, ``decay``, and remove splats below an opacity."""
+    if decay:
+        model.fade(decay)
     model.keep(model.read("opacity_logits").sigmoid() >= min_opacity)
 
 

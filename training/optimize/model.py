@@ -6,10 +6,12 @@ Splats are parametrised as in 3DGS files (``training.splats.gaussians``), as tor
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import log
 from typing import cast
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from ..rasterize import Adam, DeviceModel, Gaussians, Rendering, StepModel, make_step_model
 from ..rasterize.adam import LearningRate
@@ -179,6 +181,16 @@ class Model:
             self._device_model.assign(name, values)
         else:
             self._replace(name, values, torch.zeros_like(values), torch.zeros_like(values))
+
+    @torch.no_grad()
+    def fade(self, share: float) -> None:
+        """Reduce all opacities by a share. Moments stay the same."""
+        logits = self.read("opacity_logits")
+        faded = log(1 - share) + functional.logsigmoid(logits) - ((share - 1) * logits.sigmoid()).log1p()
+        if self._device_model is None:
+            self["opacity_logits"].copy_(faded)
+        else:
+            self._device_model.assign("opacity_logits", faded, keep_moments=True)
 
     @torch.no_grad()
     def raise_log_scales(self, minimum: torch.Tensor) -> None:

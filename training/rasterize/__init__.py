@@ -327,8 +327,8 @@ class DeviceModel(StepModel, Protocol):
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
         """Append at least one splat, with zero moments and statistics."""
 
-    def assign(self, name: str, values: torch.Tensor) -> None:
-        """Replace a tensor's values and reset its moments to zero."""
+    def assign(self, name: str, values: torch.Tensor, keep_moments: bool = False) -> None:
+        """Replace a tensor's values; reset its moments to zero unless ``keep_moments``."""
 
     def reset_stats(self) -> None:
         """Reset all statistics to zero."""

@@ -75,6 +75,19 @@ def test_splats_are_a_copy_with_extras(model):
     assert model["decay"][0] == 10 and not np.array_equal(splats.means, model["means"].detach().numpy())
 
 
+def test_fading_scales_opacities_and_keeps_moments(model, moments):
+    logits = torch.linspace(-120, 30, 50)
+    model.assign("opacity_logits", logits.clone())
+    before = [moments(model, name, k) for name in ALL for k in range(2)]
+    model.fade(0.1)
+    exact = logits.double()
+    expected = (0.9 * exact.sigmoid()).log() - (1 - 0.9 * exact.sigmoid()).log()
+    assert torch.allclose(model["opacity_logits"].double(), expected, rtol=1e-5, atol=1e-5)
+    assert model["opacity_logits"].is_leaf and model["opacity_logits"].requires_grad
+    after = [moments(model, name, k) for name in ALL for k in range(2)]
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
 def test_reset_stats_keeps_shapes():
     stats = {"seen": torch.ones(2, 4), "opacity_sum": torch.ones(2)}
     model = Model({"means": torch.zeros(2, 3)}, {"means": 0.0}, stats=stats)

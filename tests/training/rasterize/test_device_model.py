@@ -232,6 +232,20 @@ def test_log_scales_are_raised_to_their_minimum(graphics, make_splats):
     assert torch.equal(adam.tensors["log_scales"], initial)  # unchanged until copy_to_host
 
 
+def test_values_are_assigned_with_or_without_their_moments(graphics, make_splats, odd_camera, photo):
+    for keep_moments in (False, True):
+        adam = adam_of(make_splats(50))
+        model = make_step_model("gpu", adam, zero_stats(50))
+        assert model is not None
+        model.step(odd_camera, photo, StepOptions(shrink=1, **VIEW))
+        values = torch.linspace(-2, 2, 50)
+        model.assign("opacity_logits", values, keep_moments=keep_moments)
+        model.copy_to_host()
+        assert torch.equal(adam.tensors["opacity_logits"].detach(), values)
+        assert all(bool(moment.any()) == keep_moments for moment in adam.state["opacity_logits"])
+        assert all(moment.any() for moment in adam.state["means"])
+
+
 def test_steps_transfer_little_data(graphics, make_splats, odd_camera, photo):
     """The transferred bytes per step do not depend on the number of splats."""
     transferred = []

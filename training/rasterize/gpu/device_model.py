@@ -267,8 +267,8 @@ class GpuModel:
         with self.device.lock:
             self._replace_state(lambda name, buffer: self.device.extended(buffer, count, added.get(name)))
 
-    def assign(self, name: str, values: torch.Tensor) -> None:
-        """Replace a tensor's values and reset its moments to zero."""
+    def assign(self, name: str, values: torch.Tensor, keep_moments: bool = False) -> None:
+        """Replace a tensor's values; reset its moments to zero unless ``keep_moments``."""
         device = self.device
         with device.lock:
             self._settle()
@@ -279,6 +279,8 @@ class GpuModel:
                 self._sh = uploaded
             else:
                 self._run("write_columns", columns, parts=uploaded, values=self._splats)
+            if keep_moments:
+                return
             zeros = device.empty(np.float32, len(self), 2 * _width(columns))
             pairs = slice(2 * columns.start, 2 * columns.stop)
             self._run("write_columns", pairs, parts=zeros, values=self._moments)
