@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,13 @@ import torch
 from scipy.spatial import KDTree
 
 from ..errors import LodgsError
+from ..scenes.cameras import Camera
+from ..scenes.colmap import Scene
 from ..splats.gaussians import SH_C0, Splats
 from .density_control import constrained_log_scales
 from .model import NAMES
 from .neighbors import query_neighbors
+from .observed_depths import points_between
 
 MIN_POINTS = 4
 """Minimum number of distinct points to start from."""
@@ -43,6 +46,32 @@ def sample_points(
         index = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
         points, colors = points[index], colors[index]
     return points, colors
+
+
+def initial_points(
+    scene: Scene, cameras: Sequence[Camera], between: float, limit: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points to start from: the scene's, without repetitions, and others between them.
+
+    Args:
+        scene: scene with its points.
+        cameras: training views.
+        between: maximum number of points between the scene's points, as a multiple of their number.
+        limit: maximum number of points; if the scene has more, they are a random sample.
+        seed: seed of random choices.
+
+    Returns:
+        Points (N, 3) in scene coordinates and display-coded colours (N, 3) uint8.
+
+    Raises:
+        LodgsError: the scene has fewer than 4 distinct points.
+    """
+    points, colors = drop_duplicates(scene.points, scene.point_colors)
+    added, added_colors = points_between(
+        scene, cameras, min(round(between * len(points)), limit - len(points)), seed
+    )
+    points, colors = np.concatenate([points, added]), np.concatenate([colors, added_colors])
+    return sample_points(points, colors, limit, seed)
 
 
 def neighbor_distances(means: np.ndarray, neighbors: int = 3) -> np.ndarray:

@@ -47,7 +47,8 @@ class Parameters:
         0.5,
         "Remove splats closer to a training camera, or to the midpoint of two neighbouring cameras, than "
         "this fraction of its nearest scene points. Within the same distance outside the frame, keep only "
-        "splats seen by two or more photos. 0 disables.",
+        "splats seen by two or more photos. Also remove splats far in front of the points that a photo "
+        "observes around their pixel. 0 disables all.",
         high=1,
     )
     largest: float = setting(
@@ -191,6 +192,11 @@ class DensityParameters(Parameters):
         "farther away, except the last tenth. Improves small images.",
         high=1,
     )
+    points_between: float = setting(
+        1.0,
+        "Maximum number of initial splats between the scene's points, as a multiple of their number. Where a "
+        "photo has no points, those around with similar depths determine position and colour. 0 disables.",
+    )
     long_axis: bool = setting(
         True,
         "Densify by splitting splats in two along their longest axis, which changes the image little. "
@@ -206,6 +212,12 @@ class DensityParameters(Parameters):
     )
     prune_interval: int = setting(
         100, "Steps between removals of transparent splats. 0 disables.", unit="steps"
+    )
+    opacity_decay: float = setting(
+        0.1,
+        "Fraction by which opacities fall at each removal of transparent splats, so that splats without "
+        "support in several photos disappear. 0 disables.",
+        high=0.9,
     )
     opacity_reset_interval: int = setting(0, "Steps between opacity resets. 0 disables.", unit="steps")
     lr_means_steps: int = setting(
@@ -275,6 +287,8 @@ AS_PUBLISHED: dict[str, Any] = {
 PAPER: dict[str, Any] = AS_PUBLISHED | {
     "first_resolution": 1.0,
     "far_share": 0.0,
+    "points_between": 0.0,
+    "opacity_decay": 0.0,
     "long_axis": False,
     "opacity_reset_interval": 3000,
     "grad_threshold": 2e-4,

@@ -20,7 +20,7 @@ from .density_control import (
     require_rows,
     reset_opacities,
 )
-from .initialize import drop_duplicates, from_points, from_splats, sample_points
+from .initialize import from_points, from_splats, initial_points
 from .method import Drawing, Method
 from .model import Model, splat_rates
 from .parameters import SplatParameters
@@ -37,13 +37,13 @@ class SplatMethod(Method[SplatParameters, Drawing]):
     device_steps = inf
 
     def setup(self, base: Splats | None) -> None:
-        p, scene = self.parameters, self.data.scene
+        p, data = self.parameters, self.data
         if base is not None:
             self.sh_degree.full_from = 0
             tensors = from_splats(base, p.sh_degree, self.device)
         else:
-            points, colors = drop_duplicates(scene.points, scene.point_colors)
-            points, colors = sample_points(points, colors, p.growth_limit(p.splat_limit), self.seed)
+            limit = p.growth_limit(p.splat_limit)
+            points, colors = initial_points(data.scene, data.train, p.points_between, limit, self.seed)
             tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = p.densify_until * self.scheduled_steps
@@ -88,7 +88,7 @@ class SplatMethod(Method[SplatParameters, Drawing]):
             if due(p.densify_interval, completed) and completed >= p.densify_from:
                 self._densify(step)
             if due(p.prune_interval, completed) and completed >= p.densify_from:
-                prune(model, p.min_opacity)
+                prune(model, p.min_opacity, p.opacity_decay)
                 require_rows(model, step, "min_opacity")
             if due(p.opacity_reset_interval, completed) and completed < self._densify_until:
                 reset_opacities(model)  # not at the end: nothing would remove splats that stay faint

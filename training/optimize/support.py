@@ -12,9 +12,11 @@ import torch
 from scipy.spatial import KDTree
 
 from ..scenes.cameras import Camera
+from ..scenes.colmap import Scene
 from .density_control import require_rows
 from .model import Model
 from .neighbors import query_neighbors
+from .observed_depths import photo_parts
 
 NEIGHBORS = (1, 2, 4)
 """Ranks of the neighbours of a camera to form midpoints with."""
@@ -26,6 +28,14 @@ MARGIN = 0.1
 """Widening of a view on every side, as a share of its image."""
 MAX_POINTS = 20_000
 """Maximum number of scene points to test."""
+FREE_SHARE = 0.7
+"""Share of the depth of observed points in front of which no splat may stand."""
+POINT_DISTANCE = 0.03
+"""Distance from a scene point up to which splats are supported, as a fraction of their depth."""
+TESTED_PHOTOS = 8
+"""Number of photos whose observed points are tested at a time."""
+MAX_SUPPORTING_POINTS = 200_000
+"""Maximum number of scene points that support splats."""
 MIN_PHOTOS = 2
 """Photos that have to see a splat near a camera outside its frame."""
 
@@ -105,11 +115,54 @@ class Support:
         return intruding
 
 
+class ObservedSpace:
+    """Free space between photos and the points that they observe.
+
+    A splat there explains one photo and hides what others see: a blurred veil between cameras, or something
+    that moved. The depth up to which a photo's rays are free is known in parts of its image. Splats near
+    scene points may be thin objects, and do not count.
+
+    Args:
+        scene: scene with its points.
+        cameras: training views.
+    """
+
+    def __init__(self, scene: Scene, cameras: Sequence[Camera]) -> None:
+        self._photos = [(parts.camera, parts.free_depths) for parts in photo_parts(scene, cameras)]
+        self._points = KDTree(scene.points[:: -(-len(scene.points) // MAX_SUPPORTING_POINTS)])
+
+    def find_intruding(self, means: np.ndarray, turn: int) -> np.ndarray:
+        """Find points (N, 3) in front of ``FREE_SHARE`` of the free depths of some photos.
+
+        Args:
+            turn: number of the test. Consecutive tests use different photos, ``TESTED_PHOTOS`` each.
+
+        Returns:
+            (N,) bool.
+        """
+        intruding = np.zeros(len(means), bool)
+        count = len(self._photos)
+        for k in range(min(TESTED_PHOTOS, count)):
+            camera, free_depths = self._photos[(turn * TESTED_PHOTOS + k) % count]
+            rows, columns = free_depths.shape
+            (x, y), depths = (values.T for values in camera.project(means))
+            inside = np.flatnonzero(
+                (depths > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+            )
+            row = (y[inside] * (rows / camera.height)).astype(np.int64)
+            column = (x[inside] * (columns / camera.width)).astype(np.int64)
+            in_front = inside[depths[inside] < FREE_SHARE * free_depths[row, column]]
+            distances, _ = query_neighbors(self._points, means[in_front])
+            intruding[in_front] |= distances > POINT_DISTANCE * depths[in_front]
+        return intruding
+
+
 class SupportPruning:
     """Removal of splats in free space, and limits on the size of others.
 
     Args:
-        cameras, points: see :class:`Support`.
+        scene: scene with its points.
+        cameras: training views.
         free_depth: share of the nearest depth that is free space; 0 disables.
         largest: maximum standard deviation of a splat, as a share of its distance from the nearest camera
             or midpoint; 0 disables.
@@ -118,18 +171,20 @@ class SupportPruning:
         end: step from which nothing is removed or limited.
     """
 
-    def __init__(
-        self, cameras: Sequence[Camera], points: np.ndarray, free_depth: float, largest: float
-    ) -> None:
+    def __init__(self, scene: Scene, cameras: Sequence[Camera], free_depth: float, largest: float) -> None:
+        self._scene = scene
         self._cameras = cameras
-        self._points = points
         self._free_depth = free_depth
         self._largest = largest
         self.end = inf
 
     @cached_property
     def _support(self) -> Support:
-        return Support(self._cameras, self._points)
+        return Support(self._cameras, self._scene.points)
+
+    @cached_property
+    def _observed_space(self) -> ObservedSpace:
+        return ObservedSpace(self._scene, self._cameras)
 
     @torch.no_grad()
     def prune(self, model: Model, step: int) -> None:
@@ -148,5 +203,6 @@ class SupportPruning:
             model["log_scales"].clamp_max_(limits[:, None])
         if self._free_depth:
             intruding = self._support.find_intruding(means, distances, positions, self._free_depth)
+            intruding |= self._observed_space.find_intruding(means, step // PRUNE_INTERVAL)
             model.keep(torch.from_numpy(~intruding))
             require_rows(model, step, "free_depth")

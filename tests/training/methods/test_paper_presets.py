@@ -60,6 +60,8 @@ SPLATS = (
         "long_axis": (False, "3DGS program: clone and split"),
         "first_resolution": (1.0, "3DGS program: full images from the first step"),
         "far_share": (0.0, "no paper has it"),
+        "points_between": (0.0, "no paper has it"),
+        "opacity_decay": (0.0, "no paper has it"),
         "opacity_reset_interval": (3000, "3DGS program: opacity_reset_interval"),
         "prune_interval": (100, "3DGS program: densify_and_prune"),
         "densify_from": (501, "3DGS program: iteration > densify_from_iter = 500"),

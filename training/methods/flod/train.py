@@ -20,11 +20,10 @@ from ...lod.rules.bands import initial_gamma, min_scales
 from ...optimize import method
 from ...optimize.density_control import constrained_log_scales, densify, prune, reset_opacities
 from ...optimize.initialize import (
-    drop_duplicates,
     from_points,
     from_splats,
+    initial_points,
     neighbor_distances,
-    sample_points,
     to_splats,
 )
 from ...optimize.merged_levels import MergedLevels
@@ -59,8 +58,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         self._skipped_steps = self.sh_degree.completed = sum(p.steps[: p.first_level - 1])
         self.stages = LevelStages(p.stages)
         self.merged = MergedLevels(self.stages, data, p, self.seed, self.backend)
-        points, colors = drop_duplicates(data.scene.points, data.scene.point_colors)
-        self.points, self.colors = sample_points(points, colors, p.growth_limit(p.splat_limit), self.seed)
+        limit = p.growth_limit(p.splat_limit)
+        self.points, self.colors = initial_points(data.scene, data.train, p.points_between, limit, self.seed)
         self.completed: dict[int, Mapping[str, torch.Tensor]] = {}
         self.levels = p.levels
         if p.levels > 1:
@@ -192,7 +191,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             )
             model.reset_stats()
         if due(p.prune_interval, local) and local >= p.densify_from:
-            prune(model, p.min_opacity)
+            prune(model, p.min_opacity, p.opacity_decay)
         if due(p.overlap_interval, local) and level < p.levels:
             model.keep(well_separated(model.read("means").cpu(), s_min / 2))
         if due(p.opacity_reset_interval, local) and local < self._densify_until(step):
