@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-MAX_VIEWS = 40
-"""Number of training views from which dropout is disabled."""
+from .schedules import few_photos
+
 END = 7 / 8
 """Share of the steps after which dropout is disabled."""
 
@@ -18,14 +18,14 @@ class Dropout:
     """Random weights of splats, one set per step.
 
     Args:
-        rate: share of the splats to drop, decreasing to 0 at ``MAX_VIEWS`` views.
+        rate: share of the splats to drop, times :func:`few_photos`.
         views: number of training views.
         seed: seed of the run.
         device: device of the weights.
     """
 
     def __init__(self, rate: float, views: int, seed: int, device: torch.device | str = "cpu") -> None:
-        self._rate = rate * (1 - views / MAX_VIEWS)
+        self._rate = rate * few_photos(views)
         self._seed = seed
         self._device = device
 

@@ -20,6 +20,8 @@ from .observed_depths import points_between
 
 MIN_POINTS = 4
 """Minimum number of distinct points to start from."""
+MAX_START = 0.5
+"""Maximum share of all splats to start from with splats between the scene's points; others are densified."""
 
 
 def drop_duplicates(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,9 +69,9 @@ def initial_points(
         LodgsError: the scene has fewer than 4 distinct points.
     """
     points, colors = drop_duplicates(scene.points, scene.point_colors)
-    added, added_colors = points_between(
-        scene, cameras, min(round(between * len(points)), limit - len(points)), seed
-    )
+    room = round(MAX_START * limit) - len(points)
+    count = min(round(between * len(points)), room)
+    added, added_colors = points_between(scene, cameras, count, seed)
     points, colors = np.concatenate([points, added]), np.concatenate([colors, added_colors])
     return sample_points(points, colors, limit, seed)
 

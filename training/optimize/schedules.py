@@ -19,6 +19,14 @@ becomes worse than its merge at small sizes."""
 FAR_END = 0.9
 """Share of the steps of a finest level after which all images have full size, for the finest details."""
 
+MANY_PHOTOS = 40
+"""Number of training photos from which measures against overfitting are off."""
+
+
+def few_photos(count: int) -> float:
+    """Return the strength of measures against overfitting, from 1 for no photos to 0 for MANY_PHOTOS."""
+    return max(1 - count / MANY_PHOTOS, 0.0)
+
 
 def log_linear(first: float, last: float, share: float) -> float:
     """Interpolate geometrically between two values; a ``share`` above 1 gives the last value."""

@@ -24,7 +24,7 @@ from .initialize import from_points, from_splats, initial_points
 from .method import Drawing, Method
 from .model import Model, splat_rates
 from .parameters import SplatParameters
-from .schedules import FAR_END, due, log_linear, random_reduction, shrink_at
+from .schedules import FAR_END, due, few_photos, log_linear, random_reduction, shrink_at
 from .training_data import TrainingView
 
 PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
@@ -88,7 +88,7 @@ class SplatMethod(Method[SplatParameters, Drawing]):
             if due(p.densify_interval, completed) and completed >= p.densify_from:
                 self._densify(step)
             if due(p.prune_interval, completed) and completed >= p.densify_from:
-                prune(model, p.min_opacity, p.opacity_decay)
+                prune(model, p.min_opacity, p.opacity_decay * few_photos(len(self.data.train)))
                 require_rows(model, step, "min_opacity")
             if due(p.opacity_reset_interval, completed) and completed < self._densify_until:
                 reset_opacities(model)  # not at the end: nothing would remove splats that stay faint

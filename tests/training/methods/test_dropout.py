@@ -5,8 +5,9 @@ import torch
 
 from training.methods import METHODS, create
 from training.methods.flod import finish
-from training.optimize.dropout import END, MAX_VIEWS, Dropout
+from training.optimize.dropout import END, Dropout
 from training.optimize.parameters import override
+from training.optimize.schedules import MANY_PHOTOS
 
 PLAIN = ("3dgs", "flod", "octree", "clod", "lodge", "tree", "matryoshka")
 
@@ -22,7 +23,7 @@ def weights(method, step: int = 0) -> torch.Tensor:
 
 def test_dropout_rate(data):
     """Six training views: 0.4 (1 - 6 / 40) = 0.34 are dropped, the others are 1 / 0.66 times as opaque."""
-    assert len(data.train) == 6 and MAX_VIEWS == 40
+    assert len(data.train) == 6 and MANY_PHOTOS == 40
     method = make(data, dropout=0.4)
     actual = torch.cat([weights(method, step) for step in range(200)])
     assert sorted(actual.unique().tolist()) == pytest.approx([0, 1 / 0.66])

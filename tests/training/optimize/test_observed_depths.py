@@ -84,12 +84,12 @@ def test_photos_share_the_limit_evenly():
         assert len(points_between(scene_of(plane(spacing=1)), views, limit, 0)[0]) == 0
 
 
-def test_initial_points_stay_within_their_limit():
+def test_points_are_added_to_at_most_half_of_the_limit():
     points = plane(spacing=1)
-    count = len(points)
-    for between, limit, expected in ((0.0, 10**6, count), (0.1, 10**6, int(1.1 * count)), (1.0, 500, 500)):
+    assert len(points) == 400
+    for between, limit, expected in ((0.0, 10**6, 400), (0.1, 10**6, 440), (1.0, 1000, 500), (1.0, 300, 300)):
         assert len(initial_points(scene_of(points), [camera()], between, limit, 0)[0]) == expected
-    start = initial_points(scene_of(points), [camera()], 0.1, 10**6, 0)[0][:count]
+    start = initial_points(scene_of(points), [camera()], 0.1, 10**6, 0)[0][:400]
     assert {tuple(point) for point in start} == {tuple(point) for point in points.astype(np.float32)}
 
 

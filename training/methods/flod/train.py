@@ -31,7 +31,15 @@ from ...optimize.merging import merge
 from ...optimize.method import Drawing
 from ...optimize.model import Model, splat_rates
 from ...optimize.refining import refining_rates
-from ...optimize.schedules import FAR_END, LevelStages, due, log_linear, random_reduction, shrink_at
+from ...optimize.schedules import (
+    FAR_END,
+    LevelStages,
+    due,
+    few_photos,
+    log_linear,
+    random_reduction,
+    shrink_at,
+)
 from ...optimize.training_data import TrainingView
 from ...splats.gaussians import Splats
 from ...splats.levels import Level
@@ -191,7 +199,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             )
             model.reset_stats()
         if due(p.prune_interval, local) and local >= p.densify_from:
-            prune(model, p.min_opacity, p.opacity_decay)
+            prune(model, p.min_opacity, p.opacity_decay * few_photos(len(self.data.train)))
         if due(p.overlap_interval, local) and level < p.levels:
             model.keep(well_separated(model.read("means").cpu(), s_min / 2))
         if due(p.opacity_reset_interval, local) and local < self._densify_until(step):
