@@ -159,9 +159,16 @@ def test_there_is_no_cycle():
         raise AssertionError("a cycle:\n" + "\n".join(f"{a} imports {b}" for a, b in inside))
 
 
-@pytest.mark.parametrize(("package", "limit"), [("training/methods", 20), ("training/lod", 25)])
+@pytest.mark.parametrize(("package", "limit"), [("training/methods", 20), ("training/lod", 19)])
 def test_imports_inside_a_package_are_few(package, limit):
-    inside = [pair for pair in relative_imports() if all(file.startswith(f"{package}/") for file in pair)]
+    """Imports of a rule's base class do not count: every rule has one."""
+    inside = [
+        (file, target)
+        for file, target in relative_imports()
+        if file.startswith(f"{package}/")
+        and target.startswith(f"{package}/")
+        and not (file.startswith("training/lod/rules/") and target == "training/lod/rule.py")
+    ]
     assert 0 < len(inside) <= limit, sorted(inside)
 
 

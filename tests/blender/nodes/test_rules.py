@@ -1,8 +1,11 @@
 """Node groups of all rules against the rules themselves, splat by splat."""
 
+from types import ModuleType
+
 import numpy as np
 import pytest
 
+from tests.checkout import recipe_code
 from training.lod.rule import rules
 
 RULES = sorted(rules())
@@ -87,7 +90,30 @@ WITH_TABLES = [
 
 @pytest.mark.parametrize(("name", "count"), WITH_TABLES)
 def test_node_group_gives_the_weights_of_the_rule(bpy, lodgs, level, name, count):
-    rule, weights = rules()[name], []
+    compare_weights(bpy, lodgs, level, rules()[name], count)
+
+
+def test_node_group_of_the_recipe_gives_the_weights_of_its_rule(bpy, lodgs, level, monkeypatch):
+    groups, all_rules = lodgs("nodes.rules"), lodgs("training.lod.rule").rules()
+    for package, text in (("training.lod.rules", "RULE = Rings()"), ("nodes.rules", "VERSION = 1")):
+        module = ModuleType(f"{lodgs(package).__name__}.rings")
+        module.__package__ = lodgs(package).__name__
+        exec(recipe_code("Add a rule", text), vars(module))
+        if package == "nodes.rules":
+            monkeypatch.setitem(groups._modules(), "rings", module)
+        else:
+            monkeypatch.setitem(all_rules, "rings", module.RULE)
+    monkeypatch.setitem(RANGES, "coarser_radius", (7, 14))
+    compare_weights(bpy, lodgs, level, all_rules["rings"], None)
+
+
+def compare_weights(bpy, lodgs, level, rule, count):
+    """Compare the weights of a rule with those of its node group, for eight cameras and random values.
+
+    Args:
+        count: number of rows of the rule's tables, None without tables.
+    """
+    name, weights = rule.name, []
     compat, groups, selection = lodgs("compat"), lodgs("nodes.rules"), lodgs("data.selection")
     focal = FOCALS.get(name, 2.5)
     for seed in range(8):
@@ -124,8 +150,8 @@ def test_node_group_gives_the_weights_of_the_rule(bpy, lodgs, level, name, count
         differ = np.abs(actual - expected) > 2e-4
         assert differ.sum() <= 2
         weights.append(expected)
-    weights = np.concatenate(weights)
-    assert 0.1 < (weights > 0).mean() < 0.9
+    drawn = (np.concatenate(weights) > 0).mean()
+    assert 0.1 < drawn < 0.9, f"adapt RANGES or FOCALS: they draw {drawn:.0%} of the splats"
 
 
 @pytest.fixture
