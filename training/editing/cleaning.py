@@ -21,9 +21,10 @@ from ..lod.selection import rule_columns, unknown_rule_error
 from ..scenes.cameras import Camera
 from ..scenes.view_tables import VIEW_TABLES
 from ..settings import setting, settings_of
+from ..splats.batches import read_batches
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import Bundle, Level
-from ..splats.ply import Columns, read_batches
+from ..splats.ply import Columns
 from .clutter import HALO_OPACITY, SceneSubject, subject_of
 
 MAX_FLOATER_SHARE = 0.001

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..scenes.ground import ground_plane, points_near_cameras
 from ..scenes.overview import FAR, LARGE, NEAR, central_ball
+from ..splats.batches import read_batches
 from ..splats.levels import Bundle
-from ..splats.ply import read_batches
 from ..splats.portable_levels import ConcatenatedRows
 
 HALO_OPACITY, HALO_SIZE = 0.1, 0.05

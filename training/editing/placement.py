@@ -13,11 +13,11 @@ from ..lod.rule import find_rule
 from ..lod.selection import unknown_rule_error
 from ..scenes import view_tables
 from ..scenes.ground import find_ground, ground_placement
+from ..splats.batches import read_batches
 from ..splats.dialects import MAX_COORDINATE
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.georeference import Georeference
 from ..splats.levels import META_LENGTHS, NO_SPLATS, Bundle, Level
-from ..splats.ply import read_batches
 from ..splats.portable_levels import ConcatenatedRows
 from ..splats.similarity import Similarity, TransformedRows
 from .cleaning import read_relations

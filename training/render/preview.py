@@ -18,10 +18,10 @@ from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera, pick_evenly
 from ..scenes.overview import overview_camera
 from ..scenes.view_tables import read_view_tables
+from ..splats.batches import read_batches
 from ..splats.dialects import Warn, ignore
 from ..splats.gaussians import SH_C0, SplatRows, Splats
 from ..splats.levels import Bundle, Level
-from ..splats.ply import read_batches
 from .command import draw_bundle
 from .image import write_image
 

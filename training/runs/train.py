@@ -41,7 +41,7 @@ from ..splats.dialects import comments_from_meta
 from ..splats.file_rows import open_ply
 from ..splats.gaussians import SplatRows, Splats
 from ..splats.levels import NO_SPLATS, Bundle, Level
-from ..splats.ply import BATCH_ROWS, Columns, read_ply, write_ply
+from ..splats.ply import Columns, read_ply, write_ply
 from . import processes
 from .backend import choose_backend, report_backend
 from .base import open_base
@@ -443,7 +443,7 @@ class _TrainingRun:
 
 def _any_visible(base: SplatRows, data: TrainingData) -> bool:
     """Return whether a training view sees any of the splats."""
-    for batch in batch_slices(len(base), BATCH_ROWS):
+    for batch in batch_slices(len(base)):
         means = base.select(batch).means
         if any(camera.sees(means, near=data.near).any() for camera in data.train):
             return True

@@ -18,7 +18,7 @@ from .gaussians import SH_C0, SplatRows, Splats
 from .mapped_rows import release_pages, require_size
 from .morton import spatial_order
 from .ply import Element, read_elements, write_elements
-from .portable_levels import batches, splats_from_activated
+from .portable_levels import portable_batches, splats_from_activated
 from .quats import join_quats, split_quats
 from .sh import coefficient_count
 
@@ -63,7 +63,7 @@ def write_compressed_ply(path: Path, rows: SplatRows, meta: dict) -> None:
     words = np.empty((4, count), np.uint32)
     rest = np.empty((count, 3 * (coefficient_count(degree) - 1)), np.uint8)
     alphas = np.empty(count, np.uint32)
-    for begin, splats in batches(rows):
+    for begin, splats in portable_batches(rows):
         part = slice(begin, begin + len(splats))
         values[:, part] = (
             splats.means,

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from .batches import batch_slices
+from .batches import BATCH_ROWS, batch_slices
 from .coding import CodedRows
 from .dialects import Warn, drop_undrawable, dropped_message, ignore, to_3dgs
 from .gaussians import Splats
 from .mapped_rows import release_pages, require_size
 from .origin import NO_ORIGIN
-from .ply import BATCH_ROWS, read_elements, splats_from_rows
+from .ply import read_elements, splats_from_rows
 
 _ROW = "row"
 """Extra column with each splat's row in the file."""

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import atomic_write
 from .gaussians import SH_C0, Splats
-from .portable_levels import PortableLevels, batches
+from .portable_levels import PortableLevels, portable_batches
 from .spz import pack_spz
 
 MAX_DEGREE = 3
@@ -64,7 +64,7 @@ def write_glb(path: Path, levels: PortableLevels) -> None:
         for level, mesh in zip(levels.fine_to_coarse, document["meshes"], strict=True):
             attributes = mesh["primitives"][0]["attributes"]
             low, high = np.full(3, np.inf), np.full(3, -np.inf)
-            for row, splats in batches(level.rows):
+            for row, splats in portable_batches(level.rows):
                 low, high = np.minimum(low, splats.means.min(0)), np.maximum(high, splats.means.max(0))
                 for name, column in _values(splats).items():
                     offset = document["bufferViews"][attributes[name]]["byteOffset"]

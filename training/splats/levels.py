@@ -17,7 +17,7 @@ from .batches import batch_slices
 from .gaussians import SplatRows, Splats
 from .georeference import Georeference
 from .origin import NO_ORIGIN
-from .ply import BATCH_ROWS, Columns
+from .ply import Columns
 
 MAX_LEVELS = 12
 """Maximum number of levels of a job or a scene; a header has no room for many more."""
@@ -148,7 +148,7 @@ def bounding_box(sets: Sequence[SplatRows]) -> list[list[float]]:
     """Return the smallest and largest x, y, z of the finite means of all sets; zeros if there are none."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for rows in sets:
-        for batch in batch_slices(len(rows), BATCH_ROWS):
+        for batch in batch_slices(len(rows)):
             means = rows.select(batch).means
             means = means[np.isfinite(means).all(axis=1)]
             low = np.minimum(low, means.min(axis=0, initial=np.inf))

@@ -10,7 +10,7 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from ..documents import damage_error, has_decimal_commas, open_text, read_lines
 from ..errors import LodgsError
 from ..files import atomic_write
-from .batches import batch_slices
+from .batches import BATCH_ROWS, batch_slices
 from .coding import CODEBOOK, CodedRows, declared_rows, decode_elements, is_coded
 from .colors import color_names, full_intensity
 from .content import check_name
@@ -57,16 +57,8 @@ _WINDOWS_NAN = re.compile(r"-?(nan\(\w+\)|1\.#(IND|[QS]NAN)0*)", re.I)
 """NaN in text files of Windows programs."""
 _FLAT = np.float32(np.log(1e-3))
 """Logarithm of the thickness of flat splats, relative to the smaller of their other sizes."""
-BATCH_ROWS = 1 << 15
-"""Rows per batch when splats are larger than memory."""
 
 Columns = dict[str, np.ndarray]
-
-
-def read_batches(rows: SplatRows) -> Iterator[Splats]:
-    """Read all splats, BATCH_ROWS at a time; yields at least one batch, which may be empty."""
-    for begin in range(0, max(len(rows), 1), BATCH_ROWS):
-        yield rows.select(slice(begin, begin + BATCH_ROWS))
 
 
 class ElementPart(NamedTuple):
@@ -339,7 +331,7 @@ def write_elements(path: str | Path, elements: Iterable[Element], comments: Sequ
         file.write("\n".join(lines).encode("ascii"))
         for element in elements:
             for part in element.parts:
-                for batch in batch_slices(part.count, BATCH_ROWS):
+                for batch in batch_slices(part.count):
                     file.write(to_records(part.columns(batch)).data)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -25,7 +25,6 @@ from .dialects import MAX_COORDINATE
 from .gaussians import SplatRows, Splats
 from .levels import Bundle, Level
 from .origin import FAR_SPLATS, NO_ORIGIN, ORIGIN_SAMPLE, choose_origin
-from .ply import BATCH_ROWS
 from .similarity import Similarity
 
 DISTANCE_RULE, DISTANCE = "chunks", "d_l"
@@ -171,9 +170,9 @@ def join_levels(groups: Sequence[Sequence[_Part]], outside: Sequence[_Part]) -> 
     return [[*outside, *(group[min(i, len(group) - 1)] for group in groups)] for i in range(count)]
 
 
-def batches(rows: SplatRows, size: int = BATCH_ROWS):
+def portable_batches(rows: SplatRows) -> Iterator[tuple[int, Splats]]:
     """Yield the first row and the splats of each batch, with unit quaternions and without extra columns."""
-    for batch in batch_slices(len(rows), size):
+    for batch in batch_slices(len(rows)):
         splats = rows.select(batch)
         lengths = np.linalg.norm(splats.quats, axis=1, keepdims=True)
         identity = np.array([1, 0, 0, 0], np.float32)

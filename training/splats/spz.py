@@ -22,7 +22,7 @@ from ..documents import open_file
 from ..errors import LodgsError
 from ..files import atomic_write
 from .gaussians import SplatRows, Splats
-from .portable_levels import batches, splats_from_activated
+from .portable_levels import portable_batches, splats_from_activated
 from .sh import MAX_DEGREE, basis, coefficient_count
 from .similarity import Similarity
 
@@ -100,7 +100,7 @@ def write_spz(path: Path, rows: SplatRows, meta: dict) -> None:
             f"Cannot write SH degree {degree} as SPZ: programs read degree 0 to {MAX_WRITTEN_DEGREE}.",
             "Write a PLY instead.",
         )
-    extent = max((float(np.abs(splats.means).max()) for _, splats in batches(rows)), default=0.0)
+    extent = max((float(np.abs(splats.means).max()) for _, splats in portable_batches(rows)), default=0.0)
     if extent >= 2.0**_FIXED_BITS:
         raise LodgsError(
             f"Cannot write {path}: positions up to {extent:,.0f} exceed the limit of {2**_FIXED_BITS:,}.",
@@ -134,7 +134,7 @@ def _write(
     flags = _ANTIALIASED if antialias else 0
     header = _Header(version, len(rows), rows.select(slice(0, 0)).sh_degree, bits, flags)
     arrays = [np.empty((len(rows), width), np.uint8) for width in header.widths()]
-    for begin, splats in batches(rows):
+    for begin, splats in portable_batches(rows):
         part = slice(begin, begin + len(splats))
         for array, codes in zip(arrays, _encode(_flipped(splats, signs), header), strict=True):
             array[part] = codes.reshape(len(splats), -1)

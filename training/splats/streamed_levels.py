@@ -22,7 +22,7 @@ from .dialects import comments_from_meta
 from .gaussians import SplatRows, Splats
 from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
-from .ply import BATCH_ROWS, write_ply
+from .ply import write_ply
 from .portable_levels import ConcatenatedRows
 from .sog import MAX_DEGREE, META, encode_sog, load_packages, read_sog, relative_parts, sog_error
 
@@ -154,7 +154,7 @@ def _write_sog(path: Path, splats: Splats, antialias: bool) -> None:
 def _read_places(rows: SplatRows) -> np.ndarray:
     """Read the means and the radii of splats in batches, (N, 4) float32."""
     parts = []
-    for batch in batch_slices(len(rows), BATCH_ROWS):
+    for batch in batch_slices(len(rows)):
         splats = rows.select(batch)
         parts.append(np.concatenate([splats.means, _radii(splats)], axis=1))
     return np.concatenate(parts)

@@ -19,7 +19,7 @@ from .gaussians import SplatRows, Splats
 from .georeference import is_geocentric
 from .gltf import COMPRESSION, SPLATS, write_compressed_glb
 from .levels import Bundle, Level
-from .portable_levels import PortableLevels, batches
+from .portable_levels import PortableLevels, portable_batches
 
 TILESET_FILE = "tileset.json"
 MAX_TILE_SPLATS = 200_000
@@ -196,7 +196,7 @@ def _survey(rows: SplatRows, center: np.ndarray, radius: float) -> tuple[np.ndar
     The sky and floaters would put every camera inside the boxes of the other splats.
     """
     means, far = np.empty((len(rows), 3), np.float32), np.empty(len(rows), bool)
-    for begin, splats in batches(rows):
+    for begin, splats in portable_batches(rows):
         end = begin + len(splats)
         means[begin:end] = splats.means
         reach = _SIGMAS * np.exp(splats.log_scales.max(axis=1))

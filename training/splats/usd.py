@@ -22,7 +22,7 @@ from ..documents import open_file, parse_json
 from ..errors import LodgsError, printable
 from ..files import atomic_write, temporary_folder
 from .levels import Level
-from .portable_levels import PortableLevels, PortableView, batches
+from .portable_levels import PortableLevels, PortableView, portable_batches
 from .sh import coefficient_count
 from .splat_format import NeedsTrainer
 
@@ -200,7 +200,7 @@ def _columns(level: Level) -> dict[str, np.ndarray]:
         "radiance:sphericalHarmonicsCoefficients": np.empty((count * coefficients, 3), np.float32),
     }
     corners = [np.zeros((0, 3))]
-    for begin, splats in batches(rows):
+    for begin, splats in portable_batches(rows):
         end, scales = begin + len(splats), np.exp(splats.log_scales)
         reach = _SIGMAS * scales.max(axis=1, keepdims=True)
         corners += [(splats.means - reach).min(axis=0)[None], (splats.means + reach).max(axis=0)[None]]

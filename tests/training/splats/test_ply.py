@@ -13,8 +13,9 @@ from plyfile import PlyData, PlyElement
 from tests.training.splats.test_formats import random_splats
 from training.__main__ import main
 from training.errors import LodgsError
+from training.splats.batches import BATCH_ROWS
 from training.splats.file_rows import open_ply
-from training.splats.ply import BATCH_ROWS, read_elements, read_ply, splats_from_rows, write_ply
+from training.splats.ply import read_elements, read_ply, splats_from_rows, write_ply
 from training.splats.spz import write_spz
 
 # Degree 1, two splats; value = splat / 2 + number of the column.

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from training.errors import LodgsError
+from training.splats.batches import BATCH_ROWS
 from training.splats.bundle import open_bundle, write_bundle
 from training.splats.file_rows import open_ply
 from training.splats.gaussians import Splats
 from training.splats.levels import NO_SPLATS, Bundle, Level
-from training.splats.ply import BATCH_ROWS, read_ply, write_ply
+from training.splats.ply import read_ply, write_ply
 from training.splats.scratch import ScratchFile
 
 

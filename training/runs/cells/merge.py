@@ -14,13 +14,13 @@ import numpy as np
 
 from ...errors import LodgsError
 from ...scenes.regions import Region
-from ...splats.batches import batch_slices
+from ...splats.batches import BATCH_ROWS, batch_slices
 from ...splats.bundle import open_bundle, write_bundle
 from ...splats.dialects import comments_from_meta, drop_undrawable
 from ...splats.file_rows import FileRows
 from ...splats.gaussians import Splats
 from ...splats.levels import NO_SPLATS, Bundle, Level
-from ...splats.ply import BATCH_ROWS, write_ply
+from ...splats.ply import write_ply
 from ...splats.scratch import ScratchFile
 from ..folder import RunFolder
 from .plan import Division, Part

@@ -13,7 +13,6 @@ from ...files import atomic_write
 from ..batches import batch_slices
 from ..gaussians import SH_C0, SplatRows, Splats
 from ..mapped_rows import release_pages, require_size
-from ..ply import BATCH_ROWS
 from ..splat_format import SplatFormat
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -28,8 +27,7 @@ def write_splat(path: Path, splats: SplatRows, meta: dict) -> None:
         LodgsError: the file cannot be written.
     """
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        for rows_of_batch in batch_slices(len(splats), BATCH_ROWS):
-            batch = splats.select(rows_of_batch)
+        for batch in map(splats.select, batch_slices(len(splats))):
             rows = np.empty(len(batch), _ROW)
             rows["mean"], rows["scale"] = batch.means, np.exp(batch.log_scales)
             opacity = 1 / (1 + np.exp(-batch.opacity_logits.astype(np.float64)))
