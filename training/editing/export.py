@@ -9,12 +9,13 @@ from ..errors import LodgsError
 from ..settings import setting, settings_of
 from ..splats.coding import MAX_CODES
 from ..splats.dialects import comments_from_meta
-from ..splats.formats import PLY, check_degree, find_format, find_level_format, write_splats
+from ..splats.formats import PLY, find_format, find_level_format, write_splats
 from ..splats.formats.glb import FORMAT as GLB
 from ..splats.levels import NO_SPLATS, Bundle, Level
 from ..splats.origin import NO_ORIGIN
 from ..splats.ply import write_ply
 from ..splats.portable_levels import ConcatenatedRows
+from ..splats.splat_format import require_degree
 from ..splats.tiles import write_tiles
 from .bake_filter import bake_filter
 from .portable import portable_levels
@@ -138,7 +139,7 @@ def export_levels(path: Path, bundle: Bundle, options: FileOptions = DEFAULT_OPT
     kind = find_level_format(path)
     assert kind.write_levels is not None, "it is a format of levels"
     for level in bundle.levels:
-        check_degree(kind, level.rows)
+        require_degree(level.rows, kind.max_degree, kind.label)
     bundle = bundle if options.antialiased else bake_filter(bundle)
     levels, notes = portable_levels(bundle, options.original_place)
     kind.write_levels(path, levels)
@@ -152,7 +153,7 @@ def export_tiles(folder: Path, bundle: Bundle, options: FileOptions = DEFAULT_OP
         LodgsError: the folder has other files or cannot be written, or the degree is not supported.
     """
     for level in bundle.levels:
-        check_degree(GLB, level.rows)
+        require_degree(level.rows, GLB.max_degree, GLB.label)
     levels, notes = portable_levels(bundle if options.antialiased else bake_filter(bundle))
     write_tiles(folder, levels)
     return notes

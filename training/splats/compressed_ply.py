@@ -21,6 +21,7 @@ from .ply import Element, read_elements, write_elements
 from .portable_levels import portable_batches, splats_from_activated
 from .quats import join_quats, split_quats
 from .sh import coefficient_count
+from .splat_format import require_degree
 
 MAX_DEGREE = 3
 _CHUNK = 256
@@ -53,12 +54,7 @@ def write_compressed_ply(path: Path, rows: SplatRows, meta: dict) -> None:
     Raises:
         LodgsError: the SH degree is too high, or the file cannot be written.
     """
-    count, degree = len(rows), rows.select(slice(0, 0)).sh_degree
-    if degree > MAX_DEGREE:
-        raise LodgsError(
-            f"Cannot write SH degree {degree} as compressed PLY: it supports degree 0 to {MAX_DEGREE}.",
-            "Write a PLY instead.",
-        )
+    count, degree = len(rows), require_degree(rows, MAX_DEGREE, "compressed PLY")
     values = np.empty((3, count, 3), np.float32)  # positions, logarithms of scales, colours
     words = np.empty((4, count), np.uint32)
     rest = np.empty((count, 3 * (coefficient_count(degree) - 1)), np.uint8)

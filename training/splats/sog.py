@@ -28,7 +28,7 @@ from .morton import spatial_order
 from .packed_files import MAX_PALETTE_PIXELS, check_sog_file
 from .quats import join_quats, split_quats
 from .sh import degree_from_count
-from .splat_format import NeedsTrainer
+from .splat_format import NeedsTrainer, require_degree
 
 META = "meta.json"
 """Main file of a SOG, in an archive or in a folder with its images."""
@@ -77,12 +77,7 @@ def write_sog(path: Path, splats: SplatRows, meta: dict) -> None:
     """
     if not len(splats):
         raise LodgsError("Cannot write SOG: there are no splats.", "Make some splats visible.")
-    degree = splats.select(slice(0, 0)).sh_degree
-    if degree > MAX_DEGREE:
-        raise LodgsError(
-            f"Cannot write SH degree {degree} as SOG: it supports degree 0 to {MAX_DEGREE}.",
-            "Write a PLY instead.",
-        )
+    require_degree(splats, MAX_DEGREE, "SOG")
     values = splats.select(slice(0, len(splats)))
     antialias = bool(meta.get("antialias"))
     files = encode_sog(values.select(spatial_order(values.means)), antialias)

@@ -24,7 +24,8 @@ class SplatFormat(NamedTuple):
         about: tooltip in menus.
         splat_bytes: bytes per splat for each SH degree from 0 on. For formats that compress by content, these
             are averages of trained scenes (``docs/reference/formats.md``).
-        max_degree: highest SH degree that the format stores.
+        max_degree: highest SH degree that the format stores. Writers drop or refuse a higher one
+            (:func:`require_degree`).
         palette_size: maximum number of coefficient sets, a power of two, if splats share sets of SH
             coefficients; else 0.
         antialiased: True if the format stores that splats need Mip-Splatting's 2D filter.
@@ -66,6 +67,21 @@ class SplatFormat(NamedTuple):
         degree = min(degree, len(self.splat_bytes) - 1)
         palette = min(1 << count.bit_length() - 1, self.palette_size) if count else 0
         return count * self.splat_bytes[degree] + 0.88 * palette * higher_coefficients(degree)
+
+
+def require_degree(splats: SplatRows, max_degree: int, label: str) -> int:
+    """Return the degree of the splats' spherical harmonics.
+
+    Raises:
+        LodgsError: it is above ``max_degree`` of the format with the label.
+    """
+    degree = splats.select(slice(0, 0)).sh_degree
+    if degree > max_degree:
+        raise LodgsError(
+            f"Cannot write SH degree {degree} as {label}: the maximum is {max_degree}.",
+            f"Write a PLY, or reduce the degree with lodgs compress --sh-degree {max_degree}.",
+        )
+    return degree
 
 
 def higher_coefficients(degree: int) -> int:

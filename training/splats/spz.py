@@ -25,6 +25,7 @@ from .gaussians import SplatRows, Splats
 from .portable_levels import portable_batches, splats_from_activated
 from .sh import MAX_DEGREE, basis, coefficient_count
 from .similarity import Similarity
+from .splat_format import require_degree
 
 MAX_WRITTEN_DEGREE = 3
 """Highest degree that all readers know; version 3 and later store 4."""
@@ -94,12 +95,7 @@ def write_spz(path: Path, rows: SplatRows, meta: dict) -> None:
     Raises:
         LodgsError: the SH degree is too high, positions are too large, or the file cannot be written.
     """
-    degree = rows.select(slice(0, 0)).sh_degree
-    if degree > MAX_WRITTEN_DEGREE:
-        raise LodgsError(
-            f"Cannot write SH degree {degree} as SPZ: programs read degree 0 to {MAX_WRITTEN_DEGREE}.",
-            "Write a PLY instead.",
-        )
+    require_degree(rows, MAX_WRITTEN_DEGREE, "SPZ")
     extent = max((float(np.abs(splats.means).max()) for _, splats in portable_batches(rows)), default=0.0)
     if extent >= 2.0**_FIXED_BITS:
         raise LodgsError(

@@ -25,6 +25,7 @@ from .morton import spatial_order
 from .ply import write_ply
 from .portable_levels import ConcatenatedRows
 from .sog import MAX_DEGREE, META, encode_sog, load_packages, read_sog, relative_parts, sog_error
+from .splat_format import require_degree
 
 STREAMED_FILE = "lod-meta.json"
 """Main file of streamed levels, in a folder of their own."""
@@ -82,12 +83,7 @@ def write_streamed_levels(folder: Path, bundle: Bundle, measure: MeasureLeaf | N
     levels = [rows for rows in levels if len(rows)]
     if not levels:
         raise LodgsError("Cannot export levels: they contain no splats.", "Make some splats visible.")
-    degree = max(rows.select(slice(0, 0)).sh_degree for rows in levels)
-    if degree > MAX_DEGREE:
-        raise LodgsError(
-            f"Cannot write SH degree {degree} for browsers: they support degree 0 to {MAX_DEGREE}.",
-            "Reduce it with lodgs compress --sh-degree 3, and export its file.",
-        )
+    degree = max(require_degree(rows, MAX_DEGREE, "levels for web") for rows in levels)
     check_export_folder(folder, STREAMED_FILE, r"env|\d+_\d+")
     with atomic_folder(folder) as target:
         _write_files(target, levels, degree, bundle.antialias, measure)

@@ -27,7 +27,7 @@ from training.splats.formats.splat import SplatFile, write_splat
 from training.splats.gaussians import SH_C0, Splats
 from training.splats.level_folder import read_folder
 from training.splats.levels import NO_SPLATS, Bundle, Level
-from training.splats.ply import read_ply, write_ply
+from training.splats.ply import read_ply
 from training.splats.splat_format import NeedsTrainer
 from training.splats.streamed_levels import write_streamed_levels
 
@@ -191,14 +191,19 @@ def test_empty_levels_are_not_streamed(tmp_path):
         write_streamed_levels(tmp_path / "none", Bundle("flod", levels[:1]))
 
 
-def test_error_of_a_high_degree_names_the_command_that_reduces_it(tmp_path, capsys):
+HIGH_DEGREE = [("--plain", "a.spz"), ("--plain", "a.compressed.ply"), ("--plain", "a.sog"),
+               ("--levels", "a.glb"), ("--tiles", "tiles"), ("--streamed", "web")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("option", "name"), HIGH_DEGREE)
+def test_error_of_a_high_degree_names_the_command_that_reduces_it(tmp_path, capsys, option, name):
     high, low = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
-    write_ply(high, random_splats(40, 4))
-    streamed = ["--streamed", str(tmp_path / "web")]
-    assert main(["edit", high, *streamed]) == 2
+    write_bundle(high, Bundle("", [Level(1, random_splats(40, 4))]))
+    export = [option, str(tmp_path / name)]
+    assert main(["edit", high, *export]) == 2
     assert "lodgs compress --sh-degree 3" in capsys.readouterr().err
     assert main(["compress", high, "--sh-degree", "3", "--out", low]) == 0
-    assert main(["edit", low, *streamed]) == 0
+    assert main(["edit", low, *export]) == 0
 
 
 def test_streamed_levels_replace_no_foreign_files(tmp_path):

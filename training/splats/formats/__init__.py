@@ -83,16 +83,6 @@ def write_splats(path: Path, splats: SplatRows, meta: dict) -> None:
     kind.write(path, splats, meta)
 
 
-def check_degree(kind: SplatFormat, splats: SplatRows) -> None:
-    """Raise a LodgsError if a format does not store the degree of spherical harmonics."""
-    degree = splats.select(slice(0, 0)).sh_degree
-    if degree > kind.max_degree:
-        raise LodgsError(
-            f"Cannot write SH degree {degree} as {kind.label}: it supports degree 0 to {kind.max_degree}.",
-            "Write a PLY instead.",
-        )
-
-
 def find_level_format(path: Path) -> SplatFormat:
     """Return the format of all levels for a file name.
 
