@@ -93,7 +93,7 @@ def test_depth_loss_is_a_parameter_of_every_method(lodgs, root):
         assert job_settings.current_parameters(settings).depth_weight == 0.3
 
 
-def test_parameter_shows_the_presets_value_until_it_is_set(root, draw):
+def test_parameter_shows_the_presets_value_until_it_is_set(lodgs, root, draw):
     settings = root.lodgs.training
     common = ["region", "seed", "use_test_every", "preset_test_every", "model", "images", "output"]
     depth = ["use_depth_weight", "preset_depth_weight", "use_depth", "preset_depth"]
@@ -113,7 +113,8 @@ def test_parameter_shows_the_presets_value_until_it_is_set(root, draw):
     assert method_properties()[-2:] == ["use_max_splats", "max_splats"]
     assert settings.parameters.max_splats == settings.parameters.preset_max_splats == 1_000_000
     settings.method = "3dgs"
-    assert method_properties() == ["use_max_splats", "preset_max_splats"]
+    names = lodgs("training.methods").METHODS["3dgs"].panel_parameters
+    assert method_properties() == [f"{kind}_{name}" for name in names for kind in ("use", "preset")]
 
 
 def test_level_distances_can_be_set(bpy, lodgs, root, draw, fake):
