@@ -295,7 +295,8 @@ def test_paper_presets_have_published_numbers(name):
 @pytest.mark.parametrize("name", METHODS)
 def test_every_parameter_of_presets_paper_has_a_source(name):
     used = {f.name for f in method_info(name).fields if f.name not in NO_EFFECT[name]}
-    assert not used - PUBLISHED[name].keys(), "add them to PUBLISHED with a source, or to NO_EFFECT"
+    missing = sorted(used - PUBLISHED[name].keys())
+    assert not missing, f"add {missing} to PUBLISHED with a source, or to NO_EFFECT"
 
 
 @pytest.mark.parametrize(("constant", "value", "source"), CONSTANTS)
