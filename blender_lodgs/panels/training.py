@@ -122,28 +122,46 @@ def _draw_choices(
         if settings.start_from == "FILE":
             column.prop(settings, "base")
     try:
-        parameters = job_settings.current_parameters(settings)
-        levels = parameters.levels  # 0: the scene decides
-        text = f" in {levels} levels" if levels > 1 else ""
-        text += f", {settings.columns * settings.rows} cells" if settings.grid and not without_photos else ""
-        from_base = without_photos or (info.from_base and settings.start_from != "POINTS")
-        steps = parameters.base_steps if from_base else parameters.total_steps
-        say(column, f"{steps:,} steps{text}", "NONE")
-        match hold_out_interval(root):
-            case 0 if not without_photos:
-                say(layout, "No views are held out, so quality is measured on training views.", "INFO")
-            case 1:
-                say(layout, "No views are left to train on. Set Hold Out Every to 0 or at least 2.", "ERROR")
-                return
+        say(column, _steps_text(root), "NONE")
+        interval = hold_out_interval(root)
     except LodgsError as error:
         say(layout, str(error), "ERROR")
+        return
+    if interval == 0 and not without_photos:
+        say(layout, "No views are held out, so quality is measured on training views.", "INFO")
+    if interval == 1:
+        say(layout, "No views are left to train on. Set Hold Out Every to 0 or at least 2.", "ERROR")
         return
     try:
         environment.trainer_python()
     except LodgsError as error:
         draw_environment(layout, error.what)
         return
-    if not bpy.data.is_saved and not settings.output:
+    _draw_train(layout, root, resumable)
+
+
+def _steps_text(root: bpy.types.Object) -> str:
+    """Return the numbers of training steps, levels and cells as text.
+
+    Raises:
+        LodgsError: the settings are inconsistent.
+    """
+    settings = root.lodgs.training
+    without_photos = viewpoints.has_only_splats(root)
+    parameters = job_settings.current_parameters(settings)
+    has_base = method_info(settings.method).from_base and settings.start_from != "POINTS"
+    steps = parameters.base_steps if without_photos or has_base else parameters.total_steps
+    text = f"{steps:,} steps"
+    if parameters.levels > 1:  # 0: the scene decides
+        text += f" in {parameters.levels} levels"
+    if settings.grid and not without_photos:
+        text += f", {settings.columns * settings.rows} cells"
+    return text
+
+
+def _draw_train(layout: bpy.types.UILayout, root: bpy.types.Object, resumable: bool) -> None:
+    """Draw the button that trains, the estimate, and the button that makes one."""
+    if not bpy.data.is_saved and not root.lodgs.training.output:
         text = f"This file is not saved. The run is written to {run_folders.runs_parent(root)}."
         say(layout, text, "INFO")
     estimate = scene_check.last_estimate(root)

@@ -52,18 +52,21 @@ class LODGS_PT_viewport(Panel):
         if viewport.problem:
             text = f"Cannot draw splats: {viewport.problem}. Disable Gaussian Splats to draw points."
             say(layout, text, "ERROR")
-        counts = views.reduced_counts()
-        if settings.splats and not settings.native and counts:
-            say(layout, _budget_text(*counts), "INFO")
-        suggestion = view_state.suggest_budget()
-        if settings.splats and not settings.native and suggestion:
-            count, seconds, budget = suggestion
-            text = f"A redraw at rest takes {seconds:.1f} s for {short_count(count)} splats. "
-            say(layout, text + f"For quick redraws, set Splat Budget to {budget:,}.", "INFO")
-        simplified = view_state.simplified_counts()
-        if settings.splats and not settings.native and simplified:
-            moving, resting = map(short_count, simplified)
-            say(layout, f"A moving view draws {moving} of {resting} splats, the small ones enlarged.", "INFO")
+        if settings.splats and not settings.native:
+            _draw_speed(layout)
+
+
+def _draw_speed(layout: bpy.types.UILayout) -> None:
+    """Draw how many splats views draw, if fewer than all, and a budget for quick redraws."""
+    if counts := views.reduced_counts():
+        say(layout, _budget_text(*counts), "INFO")
+    if suggestion := view_state.suggest_budget():
+        count, seconds, budget = suggestion
+        text = f"A redraw at rest takes {seconds:.1f} s for {short_count(count)} splats. "
+        say(layout, text + f"For quick redraws, set Splat Budget to {budget:,}.", "INFO")
+    if simplified := view_state.simplified_counts():
+        moving, resting = map(short_count, simplified)
+        say(layout, f"A moving view draws {moving} of {resting} splats, the small ones enlarged.", "INFO")
 
 
 def _header_text(drawn: int, full: int) -> str:
