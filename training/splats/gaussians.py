@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Protocol
 
@@ -78,6 +79,12 @@ class Splats:
         return cls(
             **columns, extras={name: np.concatenate([s.extras[name] for s in sets]) for name in shared}
         )
+
+
+def equalize_degrees(sets: Sequence[Splats]) -> list[Splats]:
+    """Return the sets with the highest SH degree of them all."""
+    degree = max(splats.sh_degree for splats in sets)
+    return [splats.padded(degree) for splats in sets]
 
 
 def splat_area(log_scales: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from ..documents import open_file, parse_json
 from ..errors import LodgsError, printable
 from .batches import batch_slices
 from .bundle import write_bundle
-from .gaussians import SH_C0, Splats
+from .gaussians import SH_C0, Splats, equalize_degrees
 from .gltf import (
     CHUNK,
     COMPONENTS,
@@ -151,16 +151,15 @@ class _GlbReader:
         )
         if not same:
             return None
-        degree = max(splats.sh_degree for ((splats, _),) in fine_to_coarse)
-        for level, ((splats, _),) in zip(reversed(bundle.levels), fine_to_coarse, strict=True):
-            level.splats = splats.padded(degree)
+        parts = equalize_degrees([splats for ((splats, _),) in fine_to_coarse])
+        for level, splats in zip(reversed(bundle.levels), parts, strict=True):
+            level.splats = splats
         return bundle
 
     def _foreign(self, fine_to_coarse: list[_PlacedParts]) -> Bundle:
         placed = [place_splats(*part, self._path) for parts in fine_to_coarse for part in parts]
         meta, splats = upright_meta(placed, "Y")
-        degree = max(part.sh_degree for part in splats)
-        remaining, levels = (part.padded(degree) for part in splats), []
+        remaining, levels = iter(equalize_degrees(splats)), []
         for number, parts in enumerate(fine_to_coarse):
             joined = Splats.concatenated([next(remaining) for _ in parts])
             levels.append(Level(len(fine_to_coarse) - number, joined))

@@ -19,7 +19,7 @@ from ..errors import LodgsError, printable
 from ..files import atomic_folder, check_export_folder
 from .batches import batch_slices
 from .dialects import comments_from_meta
-from .gaussians import SplatRows, Splats
+from .gaussians import SplatRows, Splats, equalize_degrees
 from .levels import MAX_READ_LEVELS, Bundle
 from .morton import spatial_order
 from .ply import write_ply
@@ -274,9 +274,7 @@ def read_streamed_levels(path: Path, folder: Path) -> None:
         folder.mkdir()
         for lod, files in enumerate(filter(None, ranges)):
             parts = [_select(read_part(names[file]), files[file]) for file in sorted(files)]
-            parts += surroundings
-            degree = max(part.sh_degree for part in parts)
-            splats = Splats.concatenated([part.padded(degree) for part in parts])
+            splats = Splats.concatenated(equalize_degrees(parts + surroundings))
             write_ply(folder / f"lod{lod}.ply", splats, comments_from_meta(meta_of_splats))
     except LodgsError:
         raise

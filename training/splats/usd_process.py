@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import LodgsError, printable
 from .bundle import write_bundle
-from .gaussians import Splats
+from .gaussians import Splats, equalize_degrees
 from .levels import MAX_READ_LEVELS, Bundle, Level
 from .portable_levels import (
     DISTANCE,
@@ -105,10 +105,9 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
         bundle, placement = parse_description(data[DESCRIPTION], path)
         same = all(np.allclose(matrix, placement, rtol=1e-9, atol=1e-9) for matrix in matrices)
         if same and len(bundle.levels) == count:
-            fields = [_read_field(prim, path) for prim in items]
-            degree = max(splats.sh_degree for splats in fields)
-            for level, splats in zip(reversed(bundle.levels), fields, strict=True):
-                level.splats = splats.padded(degree)
+            parts = equalize_degrees([_read_field(prim, path) for prim in items])
+            for level, splats in zip(reversed(bundle.levels), parts, strict=True):
+                level.splats = splats
             return bundle
     placed = [
         place_splats(_read_field(prim, path), matrix, path)
@@ -116,8 +115,7 @@ def read_levels(usd: SimpleNamespace, path: Path) -> Bundle:
     ]
     up = usd.UsdGeom.GetStageUpAxis(stage)
     meta, placed = upright_meta(placed, "Z" if up == usd.UsdGeom.Tokens.z else "Y")
-    degree = max(splats.sh_degree for splats in placed)
-    splats = {prim: part.padded(degree) for prim, part in zip(items, placed, strict=True)}
+    splats = dict(zip(items, equalize_degrees(placed), strict=True))
     distances = next((d for root in groups if (d := _thresholds(usd, root, count))), [])
     levels = [
         Level(
