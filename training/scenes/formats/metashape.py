@@ -73,52 +73,80 @@ def read(path: Path, folder: Path) -> ExportedScene:
     if not chunks:
         raise LodgsError(f"Cannot read {path}: it has no chunk.", "Export the cameras again.")
     counts = [len(chunk.findall("cameras//transform")) for chunk in chunks]
-    chunk = chunks[counts.index(max(counts))]
     others = sum(counts) - max(counts)
     warnings = [f"Skipped {others:,} cameras in other chunks of {path}."] if others else []
-    lenses: dict[str, Intrinsics | LodgsError] = {}
-    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    for sensor in sensors.values():
-        try:
-            lenses[sensor.get("id", "")] = _parse_lens(sensor)
-        except LodgsError as error:
-            lenses[sensor.get("id", "")] = error
-    cameras = [camera for camera in chunk.iter("camera") if camera.get("label") is not None]
-    by_id = {camera.get("id", ""): camera for camera in chunk.iter("camera")}
-    aligned = [camera.get(_COMPONENT, "") for camera in cameras if camera.find("transform") is not None]
-    largest = max(aligned, key=aligned.count, default="")
-    transforms = {
-        part.get("id", ""): _parse_transform(part) for part in chunk.iterfind("components/component")
-    }
-    base = transforms.get(largest)
-    if base is None:
-        chunk_transform = _parse_transform(chunk)
-        base = transforms[largest] = np.eye(4) if chunk_transform is None else chunk_transform
-    scale = np.cbrt(np.linalg.det(base[:3, :3]))
-    files = _LabelFinder(path.parent, chunk, folder)
+    chunk = _Chunk(chunks[counts.index(max(counts))], path.parent, folder)
     views, excluded = [], []
-    for camera in cameras:
-        label = camera.get("label", "")
+    for camera in chunk.cameras:
         try:
-            if camera.get("enabled") in ("0", "false"):
-                raise LodgsError("it is disabled in Metashape.")
-            local, aligned_camera = _rig_pose(camera, by_id, sensors)
-            transform = transforms.get(aligned_camera.get(_COMPONENT, ""))
-            if transform is None:
-                raise LodgsError("Metashape did not align it with the largest group of photos.")
-            lens = lenses.get(camera.get("sensor_id", ""))
-            if not isinstance(lens, Intrinsics):
-                raise lens or LodgsError("it has no lens.")
-            pose = np.linalg.solve(base, transform @ local)
-            pose[:3, 3] *= scale
-            views.append(ExportedView(files.find(camera), lens, invert_pose(pose)))
+            views.append(chunk.view(camera))
         except LodgsError as error:
-            excluded.append((label, error.what))
-    system = (chunk.findtext("reference") or "").strip()
-    place = None
-    if system and not system.startswith(_LOCAL) and is_geocentric(base[:3, 3]):
-        place = Georeference(ECEF, base @ np.diag([1 / scale] * 3 + [1.0]))
-    return ExportedScene(views, excluded=excluded, warnings=warnings, georeference=place)
+            excluded.append((camera.get("label", ""), error.what))
+    return ExportedScene(views, excluded=excluded, warnings=warnings, georeference=chunk.georeference)
+
+
+class _Chunk:
+    """A chunk with its lenses, and the transforms of its components.
+
+    Args:
+        folder: folder of the XML file.
+        search: folder with photos.
+
+    Attributes:
+        cameras: cameras with a label.
+        georeference: place of the views on Earth, None if the chunk has none.
+    """
+
+    def __init__(self, chunk: Element, folder: Path, search: Path) -> None:
+        self.cameras = [camera for camera in chunk.iter("camera") if camera.get("label") is not None]
+        self._by_id = {camera.get("id", ""): camera for camera in chunk.iter("camera")}
+        self._sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
+        self._lenses = {name: _lens_or_error(sensor) for name, sensor in self._sensors.items()}
+        self._files = _LabelFinder(folder, chunk, search)
+        self._transforms = {
+            part.get("id", ""): _parse_transform(part) for part in chunk.iterfind("components/component")
+        }
+        aligned = [
+            camera.get(_COMPONENT, "") for camera in self.cameras if camera.find("transform") is not None
+        ]
+        largest = max(aligned, key=aligned.count, default="")
+        base = self._transforms.get(largest)
+        if base is None:
+            transform = _parse_transform(chunk)
+            base = self._transforms[largest] = np.eye(4) if transform is None else transform
+        self._base, self._scale = base, np.cbrt(np.linalg.det(base[:3, :3]))
+        system = (chunk.findtext("reference") or "").strip()
+        self.georeference = None
+        if system and not system.startswith(_LOCAL) and is_geocentric(base[:3, 3]):
+            self.georeference = Georeference(ECEF, base @ np.diag([1 / self._scale] * 3 + [1.0]))
+
+    def view(self, camera: Element) -> ExportedView:
+        """Return the view of a camera, in the axes of the largest component and in metres if known.
+
+        Raises:
+            LodgsError: the camera is disabled or not aligned, or has no supported lens; the reason is a
+                clause.
+        """
+        if camera.get("enabled") in ("0", "false"):
+            raise LodgsError("it is disabled in Metashape.")
+        local, aligned_camera = _rig_pose(camera, self._by_id, self._sensors)
+        transform = self._transforms.get(aligned_camera.get(_COMPONENT, ""))
+        if transform is None:
+            raise LodgsError("Metashape did not align it with the largest group of photos.")
+        lens = self._lenses.get(camera.get("sensor_id", ""))
+        if not isinstance(lens, Intrinsics):
+            raise lens or LodgsError("it has no lens.")
+        pose = np.linalg.solve(self._base, transform @ local)
+        pose[:3, 3] *= self._scale
+        return ExportedView(self._files.find(camera), lens, invert_pose(pose))
+
+
+def _lens_or_error(sensor: Element) -> Intrinsics | LodgsError:
+    """Return the lens of a sensor, or the reason why it cannot be used."""
+    try:
+        return _parse_lens(sensor)
+    except LodgsError as error:
+        return error
 
 
 def _parse_lens(sensor: Element) -> Intrinsics:
@@ -217,7 +245,12 @@ def _parse_transform(part: Element) -> np.ndarray | None:
 
 
 class _LabelFinder:
-    """Finds photos by camera label, in the usual folders beside the export or anywhere in another one."""
+    """Finder of photos by camera label, in the usual folders next to the export or anywhere in another one.
+
+    Args:
+        folder: folder of the export.
+        search: the other folder.
+    """
 
     def __init__(self, folder: Path, chunk: Element, search: Path) -> None:
         self._folder = folder

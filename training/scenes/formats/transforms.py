@@ -15,6 +15,7 @@ from typing import Any
 from ...errors import LodgsError
 from ...files import is_file
 from ..image_headers import image_size
+from ..lenses import Intrinsics
 from ..point_cloud import read_points
 from .exported import (
     ExportedScene,
@@ -168,23 +169,25 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     if not isinstance(values.get("file_path"), str):
         raise LodgsError("it has no file_path.")
     image = photos.find(values["file_path"])
+    lens = _parse_lens(values, image)
+    if "transform_matrix" not in values:
+        raise LodgsError("it has no transform_matrix.")
+    pose = parse_array(values.get("transform_matrix"), -1, 4)
+    names = (values.get(key) for key in ("mask_path", "depth_file_path"))
+    mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in names)
+    return ExportedView(image, lens, invert_pose(pose, opengl=True), mask, depth)
+
+
+def _parse_lens(values: Mapping[str, Any], image: Path) -> Intrinsics:
+    """Return the lens of a frame; see :func:`_parse_view`.
+
+    Args:
+        image: photo, whose size counts if the values have none.
+    """
     width, height = get_number(values, "w", 0), get_number(values, "h", 0)
     if not (width > 0 and height > 0):
         width, height = image_size(image)
-    focals = [get_number(values, name, 0) for name in _FOCALS]  # 0 is unknown
-    if not any(focals):
-        angles = zip(_ANGLES, (width, height), strict=True)
-        focals = [_focal_length(get_number(values, n), side) if n in values else 0.0 for n, side in angles]
-    if not any(focals):
-        raise LodgsError("it has neither a focal length (fl_x) nor a field of view (camera_angle_x).")
-    fx, fy = focals[0] or focals[1], focals[1] or focals[0]
-    center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
-    if 0 < center[0] < 1 and 0 < center[1] < 1:  # normalised by the size
-        sides = width, height
-        if fx < _MAX_NORMALIZED:
-            sides = _normalizing_sides(fx, fy, width, height)
-            fx, fy = fx * sides[0], fy * sides[1]
-        center = center[0] * sides[0], center[1] * sides[1]
+    focals, center = _parse_camera_matrix(values, width, height)
     if isinstance(flaw := values.get(_FLAW), str):
         raise LodgsError(flaw)
     if other := next((name for name in _OTHER_LENSES if values.get(name)), ""):
@@ -200,13 +203,32 @@ def _parse_view(folder: Path, values: Mapping[str, Any], photos: PhotoFinder) ->
     if not fisheye and model != "FULL_OPENCV" and radial[3] and not any(radial[4:]):
         raise LodgsError("its k4 has no equivalent among COLMAP's lenses.")
     tangential = (0.0, 0.0) if fisheye else (get_number(values, "p1", 0), get_number(values, "p2", 0))
-    lens = colmap_lens(width, height, (fx, fy), center, radial, tangential, fisheye)
-    if "transform_matrix" not in values:
-        raise LodgsError("it has no transform_matrix.")
-    pose = parse_array(values.get("transform_matrix"), -1, 4)
-    names = (values.get(key) for key in ("mask_path", "depth_file_path"))
-    mask, depth = (find_image(folder, name) if isinstance(name, str) else None for name in names)
-    return ExportedView(image, lens, invert_pose(pose, opengl=True), mask, depth)
+    return colmap_lens(width, height, focals, center, radial, tangential, fisheye)
+
+
+def _parse_camera_matrix(
+    values: Mapping[str, Any], width: float, height: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return fx, fy and cx, cy in pixels, which a file may state relative to the image size.
+
+    Raises:
+        LodgsError: there is neither a focal length nor a field of view.
+    """
+    focals = [get_number(values, name, 0) for name in _FOCALS]  # 0 is unknown
+    if not any(focals):
+        angles = zip(_ANGLES, (width, height), strict=True)
+        focals = [_focal_length(get_number(values, n), side) if n in values else 0.0 for n, side in angles]
+    if not any(focals):
+        raise LodgsError("it has neither a focal length (fl_x) nor a field of view (camera_angle_x).")
+    fx, fy = focals[0] or focals[1], focals[1] or focals[0]
+    center = get_number(values, "cx", width / 2), get_number(values, "cy", height / 2)
+    if 0 < center[0] < 1 and 0 < center[1] < 1:  # normalised by the size
+        sides = width, height
+        if fx < _MAX_NORMALIZED:
+            sides = _normalizing_sides(fx, fy, width, height)
+            fx, fy = fx * sides[0], fy * sides[1]
+        center = center[0] * sides[0], center[1] * sides[1]
+    return (fx, fy), center
 
 
 def _with_usual_names(values: Mapping[str, Any]) -> dict[str, Any]:
