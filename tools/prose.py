@@ -45,7 +45,7 @@ def texts(tree: ast.AST) -> Iterator[tuple[str, str]]:
                 if keyword.arg in ("description", "help", "about") and _text(keyword.value) is not None:
                     yield "interface", _text(keyword.value) or ""
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-            if name in ("parameter", "Control"):
+            if name in ("setting", "Control"):
                 yield from (("interface", text) for arg in node.args if (text := _text(arg)) is not None)
             elif name.endswith(("Error", "warn", "warning")):
                 yield from (("errors", _message(arg)) for arg in node.args if _message(arg))

@@ -22,6 +22,8 @@ def test_openings_and_the_word_what_are_counted():
 def test_errors_and_descriptions_are_read():
     source = 'f(description="How it is")\nraise LodgsError(f"What {x} is not there.", "Go.")\n'
     assert {line.split(":")[0] for line in problems(module(source))} == {"interface", "errors"}
+    for source in ('setting(1, "How it is.")', 'Control("a", 1, 0, 2, "A", "How it is")'):
+        assert [line.split(":")[0] for line in problems(module(f"{source}\n"))] == ["interface"]
 
 
 def test_function_words_as_names_are_counted():
