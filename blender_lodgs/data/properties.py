@@ -170,7 +170,7 @@ class CropSettings(bpy.types.PropertyGroup):
         name="Keep",
         description="Splats to keep, at every level",
         items=[
-            ("INSIDE", "Keep Inside", "Keep splats inside this crop and inside other crops of this kind"),
+            ("INSIDE", "Keep Inside", "Keep splats inside this crop or inside another one of this kind"),
             ("OUTSIDE", "Cut Out", "Remove splats inside this crop"),
             ("ALL", "Keep All", "Keep all splats; the crop only has a look of its own"),
         ],

@@ -201,11 +201,19 @@ class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
     )
     divide_by: bpy.props.EnumProperty(
         name="Divide By",
-        description="Rule that divides the ground into cells, which are trained separately",
+        description="Criterion for dividing the ground into cells, which are trained separately",
         items=[
             ("GRID", "By Number", "Number of columns and rows. 1 by 1 trains the scene as a whole"),
-            ("SPLATS", "By Splats", "Fewest cells within a number of splats each. Plan Cells computes them"),
-            ("MEMORY", "By Memory", "Fewest cells within a memory limit each. Plan Cells computes them"),
+            (
+                "SPLATS",
+                "By Splats",
+                "Fewest cells with at most a number of splats each. Plan Cells computes them",
+            ),
+            (
+                "MEMORY",
+                "By Memory",
+                "Fewest cells that each need at most a limit of memory. Plan Cells computes them",
+            ),
         ],
         options=set(),
     )

@@ -19,8 +19,8 @@ class LODGS_OT_check_scene(WaitingOperator, SceneOperator, bpy.types.Operator):
     bl_idname = "lodgs.check_scene"
     bl_label = "Check Scene"
     bl_description = (
-        "Look for facts about the photos and cameras that lower the quality of training, and estimate its "
-        "time, memory and disk space"
+        "Find problems of the photos and cameras that lower the quality of training, and estimate its time, "
+        "memory and disk space"
     )
 
     _findings: list[Finding] | None = None

@@ -152,7 +152,8 @@ def add_controls(parser: argparse.ArgumentParser) -> None:
     for control in all_controls().values():
         default = "" if control.follows else f" (default: the file's, else {control.default:g})"
         group.add_argument(
-            option_name(control.name), type=int if control.integer else float, metavar="N",
+            option_name(control.name), type=int if control.integer else float,
+            metavar="0|1" if control.flag else "N",
             help=control.about.replace("%", "%%") + default,
         )  # fmt: skip
 

@@ -81,7 +81,7 @@ class Compression:
         unit="steps",
     )
     sh_degree: int = setting(
-        3, "Highest degree of spherical harmonics to keep. Lower ones hardly make the file smaller.",
+        3, "Highest degree of spherical harmonics to keep. Lower degrees hardly reduce the file size.",
         label="SH Degree", high=4,
     )  # fmt: skip
     codes: int = setting(

@@ -80,14 +80,14 @@ class Parameters:
     )
     depth_weight: float = setting(
         0.0,
-        "Initial weight of the depth loss where depth is known (see depth): L1 of inverse depth, in inverse "
-        "median depths. It decreases to a hundredth. 0 disables.",
+        "Initial weight of the depth loss, L1 of inverse depth in inverse median depths, at pixels where "
+        "the depth source has a value. It decreases to a hundredth. 0 disables.",
     )
     depth: str = setting(
         "metric",
-        "Source of depth: maps in the folder depths in scene units (metric), maps of depth (relative) or of "
-        "inverse depth (inverse) with scale and shift fitted to the scene's points in each view, or only "
-        "these points (points).",
+        "Source of depth: maps of depth in scene units (metric), of relative depth (relative) or of relative "
+        "inverse depth (inverse), or the scene's points (points). Maps are in the folder depths. "
+        "Scale and shift of relative ones are fitted to the points of each view.",
         label="Depth Source",
         choices=DEPTH_KINDS,
     )

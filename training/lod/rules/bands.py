@@ -41,8 +41,8 @@ class Bands(Rule):
     controls = (
         Control(
             "gamma", 1.0, 0.01, 1000.0, "Screen Size",
-            "γ: switch to a finer level if the smallest detail of the coarser one covers this many pixels. "
-            "Smaller is finer",
+            "Switch to a finer level where the smallest detail of the coarser one covers this many pixels "
+            "(FLoD: γ). Smaller is finer",
             soft=(0.1, 10.0), unit="px",
         ),
         Control(

@@ -50,12 +50,12 @@ class Chunks(Rule):
         ),
         Control(
             "chunks", 1, 0, 1, "Chunks",
-            "Show the fixed sets of the two nearest chunks; 0 measures distances from the camera",
+            "Show the fixed sets of the two nearest chunks. If disabled, select levels by camera distance",
             integer=True,
         ),
         Control(
             "fade", 1, 0, 1, "Fade",
-            "Fade between neighbouring chunks; 0 switches to the nearest one's set at once",
+            "Fade between neighbouring chunks. If disabled, switch to the set of the nearest one",
             integer=True,
         ),
     )  # fmt: skip

@@ -79,11 +79,11 @@ class Decay(Rule):
     controls = (
         Control(
             "s_v", 1.0, 1.0, 100.0, "Distance Scale",
-            "s_v: factor on camera distances. Larger shows fewer splats", soft=(1.0, 10.0),
+            "Factor on camera distances (CLoD-GS: s_v). Larger shows fewer splats", soft=(1.0, 10.0),
         ),
         Control(
             "at_most", 0, 0, 2**30, "Splat Limit",
-            "Maximum number of splats: raises s_v as needed. 0 disables",
+            "Maximum number of splats. Raises the distance scale as needed. 0 disables",
             integer=True, step=1000,
         ),
     )  # fmt: skip

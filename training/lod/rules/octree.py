@@ -63,7 +63,7 @@ class Octree(Rule):
         ),
         Control(
             "fade", 1, 0, 1, "Fade",
-            "Fade levels in as the camera approaches; 0 switches at once", integer=True,
+            "Fade levels in as the camera approaches. If disabled, they appear at once", integer=True,
         ),
     )  # fmt: skip
 

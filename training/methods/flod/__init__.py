@@ -71,8 +71,8 @@ class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
     last_level: int = setting(0, "Last level to train. 0 means the finest.")
     finish_share: float = setting(
         0.2,
-        "Additional steps at the end that train the three finest levels as blended by distance, as a "
-        "fraction of all levels' steps. Merged levels need at most a fifth of 'refine_steps'. Trained "
+        "Additional steps at the end that train the three finest levels together, as selected by distance, "
+        "as a fraction of all levels' steps. Merged levels have at most a fifth of 'refine_steps'. Trained "
         "levels with fine detail restart from the most important splats of the finest level. Not in the "
         "paper.",
         high=1,
@@ -119,7 +119,7 @@ class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
 
     @property
     def finish_steps(self) -> int:
-        """Number of finishing steps, which train the finest levels blended.
+        """Number of finishing steps, which train the finest levels together.
 
         Zero if the finest level is not trained, or is the only one.
         """

@@ -69,14 +69,14 @@ class OctreeParameters(Parameters):
     )
     coarse_share: float = setting(
         0.25,
-        "Fraction of the steps in which levels join one by one. Anchors grow into the next level only after "
-        "them.",
+        "Fraction of the steps in which levels join one by one. Anchors grow into the next level only "
+        "afterwards.",
         high=1,
     )
     joins: str = setting(
         "early",
         "Schedule of the levels. Early: half of them start at once, and the last one joins before "
-        "'coarse_share' ends. Published: one more starts at once, and the last one joins at its end.",
+        "'coarse_share' ends. Published: one more level starts at once, and the last one joins at its end.",
         choices=("early", "published"),
     )
     init_level: int = setting(
