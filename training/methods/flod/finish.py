@@ -1,4 +1,4 @@
-"""Finishing steps of FLoD: restart the levels before the finest, then train all of them for selection by distance.
+"""Finishing steps of FLoD: restart the levels before the finest, then train all as selected by distance.
 
 Not in the paper (FLoD, Sec. 5.2), which trains each level on its own, before the finer ones; no step
 renders two levels, nor the transitions between them. Here the finest levels are rows of one model. Levels
