@@ -13,7 +13,7 @@ MASK_THRESHOLD = 0.5
 
 
 def to_8_bit(image: torch.Tensor) -> torch.Tensor:
-    """Clamp to [0, 1] and round to the 256 values of 8-bit files, as float32."""
+    """Clamp values of any shape to [0, 1] and round them to the 256 values of 8-bit files, as float32."""
     return (image.detach().clamp(0, 1) * 255).round() / 255
 
 

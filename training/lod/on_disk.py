@@ -146,7 +146,7 @@ def read_or_open_bundle(path: str | Path) -> Bundle:
 
 
 class CulledReader:
-    """Reads blocks of a level's splats that a camera can see. Reads all splats once to find their bounds.
+    """Reader of the blocks of a level that a camera can see. It reads all splats once to find their bounds.
 
     Args:
         rows: rows of the level; blocks can be skipped only if rows are in spatial order.

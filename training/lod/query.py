@@ -158,7 +158,7 @@ class PageUpdate:
 
 
 class Pager(Protocol):
-    """Reads the pages of a file that a camera needs, in a thread.
+    """Reader of the pages of a file that a camera needs, in a thread.
 
     The caller owns the memory of ``rows`` splats and copies updates into it (:meth:`take`), where new pages
     replace old ones. Then the weights of the rule give a complete selection of the splats in memory.
@@ -246,7 +246,7 @@ class PagedFile(Protocol):
 
 
 class SplatSelector:
-    """Selects splats of one set, for one query after another.
+    """Selection of splats from one set, for one query after another.
 
     While the camera stays in a region (``Rule.region``), only splats of that region are evaluated. If rows
     are sorted by space (``blocks.spatial_order``), blocks outside the rule's distance band

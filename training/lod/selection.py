@@ -127,7 +127,7 @@ def select_levels(
 
 
 class BundleSelector:
-    """Computes weights of a bundle's splats for many cameras, without copying splats.
+    """Selector of a bundle's splats for many cameras, which copies no splats.
 
     Callers keep ``splats`` where they render, for example on a GPU; splats of weight 0 cost a rasterizer next
     to nothing.
@@ -155,7 +155,7 @@ class BundleSelector:
         return Splats.concatenated([level.splats for level in self._levels])
 
     def level_weights(self, position: np.ndarray, focal_px: float, values: Values) -> list[np.ndarray]:
-        """Return the weights of each level's splats; arguments as for :func:`select`."""
+        """Return the weights (N,) of each level's N splats; arguments as for :func:`select`."""
         position = np.asarray(position, np.float32)
         return [
             self._rule.weights(level.splats.means, position, focal_px, columns, facts, values, self._tables)

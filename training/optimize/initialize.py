@@ -27,6 +27,13 @@ MAX_START = 0.5
 def drop_duplicates(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Drop repeated points. Their neighbour distance is 0, which gives no scale.
 
+    Args:
+        points: (N, 3), in any unit.
+        colors: (N, 3) of any type.
+
+    Returns:
+        The M distinct points, sorted by coordinates, and the colour of the first of each, (M, 3) both.
+
     Raises:
         LodgsError: fewer than 4 points remain.
     """
@@ -43,7 +50,7 @@ def drop_duplicates(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray,
 def sample_points(
     points: np.ndarray, colors: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw at most ``count`` random points, keeping their order."""
+    """Draw at most ``count`` of the points (N, 3) and their colours (N, 3) at random, keeping their order."""
     if len(points) > count:
         index = np.sort(np.random.default_rng(seed).choice(len(points), count, replace=False))
         points, colors = points[index], colors[index]
@@ -132,7 +139,10 @@ def from_points(
 def from_splats(
     splats: Splats, sh_degree: int, device: torch.device | str = "cpu"
 ) -> dict[str, torch.Tensor]:
-    """Copy a base's splats to tensors by name, truncating or zero-padding harmonics to ``sh_degree``."""
+    """Copy splats to float32 tensors by name, truncating or zero-padding harmonics to ``sh_degree``.
+
+    The names are NAMES; shapes are those of :class:`Splats`.
+    """
     terms = (sh_degree + 1) ** 2
     sh = np.zeros((len(splats), terms, 3), np.float32)
     sh[:, : splats.sh.shape[1]] = splats.sh[:, :terms]

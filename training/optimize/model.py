@@ -108,7 +108,7 @@ class Model:
         return model
 
     def read(self, name: str) -> torch.Tensor:
-        """Return a read-only copy or view of a trained tensor or a stat. The model stays on its device."""
+        """Return a read-only copy or view of a trained tensor or stat (N, ...), without moving the model."""
         if self._device_model is not None and (name in NAMES or name in self._stats):
             return self._device_model.read(name)
         return self._stats[name] if name in self._stats else self._adam.tensors[name].detach()
@@ -156,7 +156,7 @@ class Model:
 
     @torch.no_grad()
     def append(self, rows: Mapping[str, torch.Tensor]) -> None:
-        """Add rows of all trained tensors, and optionally columns, with zero moments as in 3DGS."""
+        """Add rows (M, ...) of all trained tensors, and optionally columns, with zero moments as in 3DGS."""
         count = len(rows["means"])
         if self._device_model is not None and count:
             self._device_model.append({name: rows[name] for name in NAMES})
@@ -176,7 +176,7 @@ class Model:
 
     @torch.no_grad()
     def assign(self, name: str, values: torch.Tensor) -> None:
-        """Replace a trained tensor's values and reset its moments to zero."""
+        """Replace a trained tensor by one of the same shape and reset its moments to zero."""
         if self._device_model is not None and name in NAMES:
             self._device_model.assign(name, values)
         else:
@@ -234,7 +234,10 @@ class Model:
             self.stats[name] = torch.zeros_like(column)
 
     def mean_gradient(self) -> torch.Tensor:
-        """Return the mean image-plane gradient norm over the views that drew each splat."""
+        """Return the mean image-plane gradient norm (N,) over the views that drew each splat.
+
+        It has the shape of the stats if these are not (N,).
+        """
         return self.read("gradient_sum") / self.read("seen").clamp_min(1)
 
     def _replace(self, name: str, tensor: torch.Tensor, first: torch.Tensor, second: torch.Tensor) -> None:

@@ -88,9 +88,11 @@ def ground_plane(
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return normal, point and score of the ground plane, see :func:`find_ground`; None without one.
 
-    The score is a fraction of the points, at least MIN_SHARE.
+    The unit normal (3,) points up. The score is a fraction of the points, at least MIN_SHARE.
 
     Args:
+        points: (N, 3).
+        up: (3,) approximate up direction, of any length.
         max_slope: maximum angle between the plane and the horizontal, in degrees.
         thickness: one of THICKNESSES.
     """

@@ -176,7 +176,7 @@ def draw_pairs(names: Sequence[str], pairs: Sequence[Sequence], placed: Sequence
 
 
 class _Progress:
-    """Reports progress by polling COLMAP's database, because COLMAP's functions report none.
+    """Progress of COLMAP, polled from its database because its functions report none.
 
     This process polls, because two copies of SQLite in one process break each other's locks.
     """

@@ -32,7 +32,7 @@ _SIDEWAYS = 5
 
 
 class ViewCollector:
-    """Collects the usable views of a model and the reasons for skipping the other views.
+    """Collector of the usable views of a model, and of the reasons for skipping the other views.
 
     Attributes:
         excluded: (name, sentence) for each skipped view.

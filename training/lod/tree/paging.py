@@ -248,7 +248,7 @@ def pages_ahead(index: BlockIndex, position: np.ndarray, direction: np.ndarray) 
 
 
 class TreePager:
-    """Reads the pages of a tree that a camera needs, in a thread; see ``query.Pager``.
+    """Reader of the pages of a tree that a camera needs, in a thread; see ``query.Pager``.
 
     Empty rows have a parent size of 0, so that no camera sees them.
 

@@ -121,7 +121,7 @@ class Tree:
 
 
 class UniqueSizes:
-    """Computes sizes such that no two nodes have the same size and position.
+    """Sizes of nodes such that no two nodes have the same size and position.
 
     If only a part of a tree is read, children identify their parent by its size and position
     (``nodes.ResidentTree``), but equal splats have equal parents. Keeps 8 bytes per node in memory.

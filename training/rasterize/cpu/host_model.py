@@ -28,7 +28,7 @@ def image_planes(target: Target) -> np.ndarray:
 
 
 class HostModel:
-    """Trains the tensors of an optimizer in place; see ``StepModel`` of :mod:`training.rasterize`.
+    """Tensors of an optimizer, trained in place; see ``StepModel`` of :mod:`training.rasterize`.
 
     Args:
         adam: optimizer of means, quats, log_scales, opacity_logits and sh.

@@ -18,7 +18,7 @@ TENSORS = tuple(field.name for field in fields(Gaussians))
 
 
 class CardModel:
-    """Trains the tensors of an optimizer in place; see ``StepModel`` of :mod:`training.rasterize`.
+    """Tensors of an optimizer, trained in place; see ``StepModel`` of :mod:`training.rasterize`.
 
     Args:
         adam: optimizer of TENSORS, on a GPU.

@@ -131,7 +131,7 @@ def _stop_stage(stage: Sequence[_PartWatch]) -> None:
 
 
 class _PartWatch:
-    """Submits a part and follows its progress.
+    """A submitted part and its progress.
 
     Attributes:
         code: exit code of the last trainer; None while training continues or is retried.

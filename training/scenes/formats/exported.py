@@ -300,7 +300,7 @@ def finite_points(
 
 
 class PhotoFinder:
-    """Finds photos below a folder by the last parts of their exported names.
+    """Finder of photos below a folder by the last parts of their exported names.
 
     Args:
         names: exported names of all photos. A photo at the exported place of one is no match for another.
