@@ -124,41 +124,29 @@ def falloff() -> bpy.types.Material:
 def _build_falloff(tree: bpy.types.NodeTree) -> None:
     """Build the nodes of :func:`falloff`."""
     tree.nodes.clear()
-    add = Nodes(tree).add
-
-    def math_node(
-        operation: str, *values: bpy.types.NodeSocket | float, kind: str = "ShaderNodeMath"
-    ) -> bpy.types.NodeSocket:
-        node = add(kind, operation=operation)
-        for socket, value in zip(node.inputs, values, strict=False):
-            if isinstance(value, bpy.types.NodeSocket):
-                tree.links.new(value, socket)
-            else:
-                socket.default_value = value
-        single = kind == "ShaderNodeMath" or operation in ("DOT_PRODUCT", "LENGTH")
-        return node.outputs["Value" if single else "Vector"]
-
+    nodes = Nodes(tree)
+    add = nodes.add
     geometry = add("ShaderNodeNewGeometry")
     local = add("ShaderNodeVectorTransform", vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT")
     tree.links.new(geometry.outputs["Incoming"], local.inputs["Vector"])
-    direction = math_node("NORMALIZE", local.outputs["Vector"], kind="ShaderNodeVectorMath")
+    direction = nodes.vector("NORMALIZE", local.outputs["Vector"])
     surface = add("ShaderNodeTexCoord").outputs["Object"]
-    along = math_node("DOT_PRODUCT", surface, direction, kind="ShaderNodeVectorMath")
-    radius2 = math_node("DOT_PRODUCT", surface, surface, kind="ShaderNodeVectorMath")
-    distance2 = math_node("SUBTRACT", radius2, math_node("MULTIPLY", along, along))
+    along = nodes.vector("DOT_PRODUCT", surface, direction)
+    radius2 = nodes.vector("DOT_PRODUCT", surface, surface)
+    distance2 = nodes.math("SUBTRACT", radius2, nodes.math("MULTIPLY", along, along))
     opacity = add("ShaderNodeAttribute", attribute_name=ALPHA, attribute_type="INSTANCER").outputs["Fac"]
-    gaussian = math_node("POWER", math_node("DIVIDE", MIN_ALPHA, opacity), distance2)
-    alpha = math_node("MINIMUM", math_node("MULTIPLY", opacity, gaussian), 0.99)
-    stretch = math_node("LENGTH", local.outputs["Vector"], kind="ShaderNodeVectorMath")
-    length = math_node("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
-    half_chord = math_node("ABSOLUTE", along)
-    starts_inside = math_node("LESS_THAN", length, math_node("MULTIPLY", half_chord, 2.0))
-    passed_center = math_node("GREATER_THAN", length, half_chord)
-    exits = math_node(
-        "MULTIPLY", geometry.outputs["Backfacing"], math_node("MULTIPLY", starts_inside, passed_center)
+    gaussian = nodes.math("POWER", nodes.math("DIVIDE", MIN_ALPHA, opacity), distance2)
+    alpha = nodes.math("MINIMUM", nodes.math("MULTIPLY", opacity, gaussian), 0.99)
+    stretch = nodes.vector("LENGTH", local.outputs["Vector"])
+    length = nodes.math("MULTIPLY", add("ShaderNodeLightPath").outputs["Ray Length"], stretch)
+    half_chord = nodes.math("ABSOLUTE", along)
+    starts_inside = nodes.math("LESS_THAN", length, nodes.math("MULTIPLY", half_chord, 2.0))
+    passed_center = nodes.math("GREATER_THAN", length, half_chord)
+    exits = nodes.math(
+        "MULTIPLY", geometry.outputs["Backfacing"], nodes.math("MULTIPLY", starts_inside, passed_center)
     )
-    enters = math_node("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
-    factor = math_node("MULTIPLY", alpha, math_node("ADD", enters, exits))
+    enters = nodes.math("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
+    factor = nodes.math("MULTIPLY", alpha, nodes.math("ADD", enters, exits))
     color = add("ShaderNodeAttribute", attribute_name=COLOR, attribute_type="INSTANCER")
     emission, transparent, mix = (
         add(kind) for kind in ("ShaderNodeEmission", "ShaderNodeBsdfTransparent", "ShaderNodeMixShader")
