@@ -126,22 +126,8 @@ def _read_table(path: Path, folder: Path) -> ExportedScene:
                 raise LodgsError(f"its row has {len(row)} values instead of {len(columns)}.")
             image = photos.find(values["name"])
             coefficients = [get_number(values, name, 0) for name in _COEFFICIENTS]
-            if "f_pix" in values:
-                width, height = image_size(image)
-                center = [get_number(values, f"{axis}_pix") for axis in ("px", "py")]
-                lens = _brown(width, height, get_number(values, "f_pix"), center, coefficients)
-                world_to_camera = np.eye(4)
-                world_to_camera[:3, :3] = parse_array([values[name] for name in _MATRIX], 3, 3)
-                world_to_camera[:3, 3] = parse_array([values[name] for name in ("tx", "ty", "tz")], 3)
-                pose = invert_pose(np.linalg.inv(world_to_camera))
-            else:
-                offset = get_number(values, "px", 0), get_number(values, "py", 0)
-                lens = _lens(image, get_number(values, "f"), offset, coefficients)
-                angles = [get_number(values, name) for name in ("yaw", "pitch", "roll")]
-                position = [get_number(values, name) for name in ("x", "y", "alt")]
-                pose = _pose(attitude(*angles).T, position)
+            views.append(_parse_view(values, image, coefficients))
             only_k1 += bool(coefficients[0]) and not any(coefficients[1:])
-            views.append(ExportedView(image, lens, pose))
         except (LodgsError, np.linalg.LinAlgError) as error:
             reason = error.what if isinstance(error, LodgsError) else "its pose is not a rotation."
             excluded.append((row[0], reason))
@@ -152,6 +138,27 @@ def _read_table(path: Path, folder: Path) -> ExportedScene:
             f"photos are distorted wrongly. Then {_REMEDY}."
         )
     return ExportedScene(views, excluded=excluded, warnings=warnings)
+
+
+def _parse_view(values: Mapping[str, str], image: Path, coefficients: list[float]) -> ExportedView:
+    """Return the view of a row: with a matrix and pixels, or with angles and a relative focal length.
+
+    Args:
+        coefficients: values of _COEFFICIENTS.
+    """
+    if "f_pix" in values:
+        width, height = image_size(image)
+        center = [get_number(values, f"{axis}_pix") for axis in ("px", "py")]
+        lens = _brown(width, height, get_number(values, "f_pix"), center, coefficients)
+        world_to_camera = np.eye(4)
+        world_to_camera[:3, :3] = parse_array([values[name] for name in _MATRIX], 3, 3)
+        world_to_camera[:3, 3] = parse_array([values[name] for name in ("tx", "ty", "tz")], 3)
+        return ExportedView(image, lens, invert_pose(np.linalg.inv(world_to_camera)))
+    offset = get_number(values, "px", 0), get_number(values, "py", 0)
+    lens = _lens(image, get_number(values, "f"), offset, coefficients)
+    angles = [get_number(values, name) for name in ("yaw", "pitch", "roll")]
+    position = [get_number(values, name) for name in ("x", "y", "alt")]
+    return ExportedView(image, lens, _pose(attitude(*angles).T, position))
 
 
 def _parse_rows(path: Path, lines: Iterator[str], delimiter: str) -> list[list[str]]:
