@@ -114,23 +114,33 @@ class LODGS_PT_detail(LevelsPanel):
                 row.prop(settings.controls, control.name, slider=control.soft is not None)
             for reason in dict.fromkeys(inactive.values()):
                 say(column, reason, "INFO")
-            row = column.row(align=True)
-            row.prop(settings, "camera_choice")
-            row.prop(settings, "freeze", text="", icon="FREEZE")
-            camera = find_choice(settings.camera_choice)
-            if camera.object:
-                column.prop(settings, camera.object)
-                if getattr(settings, camera.object) is None:  # distances are then measured from the origin
-                    layout.label(text="No object", icon="ERROR")
-            elif camera.position and not camera.viewport:
-                column.prop(settings, camera.position, text="Position")
-            if context.scene.camera is None and not camera.viewport:
-                layout.label(text="No active camera", icon="ERROR")
+            _draw_camera(layout, column, context, settings)
         for item in settings.tables:
             if item.collection and len(item.collection.objects) > 1:  # the first object holds the rows
                 text, spheres = f"Show {item.name.title()}", item.collection
                 layout.prop(spheres, "hide_viewport", text=text, toggle=True, invert_checkbox=True)
         _draw_counts(layout, context, root)
+
+
+def _draw_camera(
+    layout: bpy.types.UILayout,
+    column: bpy.types.UILayout,
+    context: bpy.types.Context,
+    settings: bpy.types.PropertyGroup,
+) -> None:
+    """Draw the choice of the camera from which distances are measured, and warnings below the column."""
+    row = column.row(align=True)
+    row.prop(settings, "camera_choice")
+    row.prop(settings, "freeze", text="", icon="FREEZE")
+    camera = find_choice(settings.camera_choice)
+    if camera.object:
+        column.prop(settings, camera.object)
+        if getattr(settings, camera.object) is None:  # distances are then measured from the origin
+            layout.label(text="No object", icon="ERROR")
+    elif camera.position and not camera.viewport:
+        column.prop(settings, camera.position, text="Position")
+    if context.scene.camera is None and not camera.viewport:
+        layout.label(text="No active camera", icon="ERROR")
 
 
 def _draw_counts(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Object) -> None:
