@@ -200,6 +200,14 @@ class Model:
         else:
             self._device_model.raise_log_scales(minimum)
 
+    @torch.no_grad()
+    def lower_log_scales(self, maximum: torch.Tensor) -> None:
+        """Lower each splat's log-scales to its maximum (N,), on the CPU."""
+        if self._device_model is None:
+            self["log_scales"].clamp_max_(maximum.to(self["log_scales"])[:, None])
+        else:
+            self._device_model.lower_log_scales(maximum)
+
     def freeze_rows(self, rows: torch.Tensor) -> None:
         """Exclude rows, (N,) bool, from training from now on."""
         self.columns[FROZEN] = rows.to(self["means"])

@@ -195,12 +195,11 @@ class SupportPruning:
         """
         if step >= self.end or not (self._free_depth or self._largest):
             return
-        means = model["means"].detach().cpu().numpy()
+        means = model.read("means").cpu().numpy()
         distances, positions = self._support.nearest_positions(means)
         if self._largest:
             sizes = np.maximum(self._largest * distances, np.finfo(np.float32).tiny)
-            limits = torch.from_numpy(np.log(sizes)).to(model["log_scales"])
-            model["log_scales"].clamp_max_(limits[:, None])
+            model.lower_log_scales(torch.from_numpy(np.log(sizes)).float())
         if self._free_depth:
             intruding = self._support.find_intruding(means, distances, positions, self._free_depth)
             intruding |= self._observed_space.find_intruding(means, step // PRUNE_INTERVAL)

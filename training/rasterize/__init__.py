@@ -336,6 +336,9 @@ class DeviceModel(StepModel, Protocol):
     def raise_log_scales(self, minimum: torch.Tensor) -> None:
         """Raise every log-scale of a splat to at least its minimum (N,)."""
 
+    def lower_log_scales(self, maximum: torch.Tensor) -> None:
+        """Lower every log-scale of a splat to at most its maximum (N,)."""
+
     def copy_to_host(self) -> None:
         """Replace the host's tensors, moments and statistics by the device's values."""
 

@@ -13,6 +13,7 @@ from training.optimize.initialize import from_points
 from training.optimize.method import require_finite
 from training.optimize.model import Model
 from training.optimize.parameters import override
+from training.optimize.support import SupportPruning
 from training.rasterize import StepOptions, Target
 from training.scenes.cameras import Camera
 
@@ -117,6 +118,16 @@ def test_density_control_on_device_equals_host(graphics, monkeypatch, max_bytes)
         assert torch.equal(first_tensor, second_tensor)
     first.keep(torch.zeros(len(first), dtype=torch.bool))
     assert len(first) == 0 and first._device_model is None
+
+
+def test_support_pruning_on_device_equals_host(graphics, data):
+    first, second = trained(1000), trained(1000)
+    second.adam.zero_grad()  # copies it to the host
+    for model in (first, second):
+        SupportPruning(data.train, data.scene.points, free_depth=0.5, largest=0.01).prune(model, 0)
+    assert first._device_model is not None and second._device_model is None and 0 < len(first) < 1000
+    for tensors in zip(_flat(first.state_dict()), _flat(second.state_dict()), strict=True):
+        assert torch.equal(*tensors)
 
 
 def test_density_control_transfers_little(graphics):

@@ -220,7 +220,7 @@ def test_unused_data_stays_unchanged(graphics, make_splats, odd_camera, photo):
     assert not torch.equal(final["means"][10:], initial["means"][10:])
 
 
-def test_log_scales_are_raised_to_their_minimum(graphics, make_splats):
+def test_log_scales_are_limited(graphics, make_splats):
     adam = adam_of(make_splats(50))
     model = make_step_model("gpu", adam, {})
     initial = adam.tensors["log_scales"].detach().clone()
@@ -228,7 +228,12 @@ def test_log_scales_are_raised_to_their_minimum(graphics, make_splats):
     minimum = torch.linspace(-4, 0, 50)
     minimum[7] = -torch.inf
     model.raise_log_scales(minimum)
-    assert torch.equal(model.read("log_scales"), torch.maximum(initial, minimum[:, None]))
+    raised = torch.maximum(initial, minimum[:, None])
+    assert torch.equal(model.read("log_scales"), raised)
+    maximum = torch.linspace(-2, -3, 50)
+    maximum[9] = torch.inf
+    model.lower_log_scales(maximum)
+    assert torch.equal(model.read("log_scales"), torch.minimum(raised, maximum[:, None]))
     assert torch.equal(adam.tensors["log_scales"], initial)  # unchanged until copy_to_host
 
 

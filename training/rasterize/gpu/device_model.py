@@ -293,11 +293,17 @@ class GpuModel:
 
     def raise_log_scales(self, minimum: torch.Tensor) -> None:
         """Raise every log-scale of a splat to at least its minimum (N,)."""
-        lowest = minimum.numpy().clip(np.finfo(np.float32).min)  # not every device supports infinity
+        self._limit_log_scales("raise_columns", minimum)
+
+    def lower_log_scales(self, maximum: torch.Tensor) -> None:
+        """Lower every log-scale of a splat to at most its maximum (N,)."""
+        self._limit_log_scales("lower_columns", maximum)
+
+    def _limit_log_scales(self, entry: str, limits: torch.Tensor) -> None:
+        finite = torch.nan_to_num(limits).numpy()  # not every device supports infinity
         with self.device.lock:
             self._settle()
-            columns = COLUMNS["log_scales"]
-            self._run("raise_columns", columns, parts=self.device.upload(lowest), values=self._splats)
+            self._run(entry, COLUMNS["log_scales"], parts=self.device.upload(finite), values=self._splats)
 
     def copy_to_host(self) -> None:
         """Replace the host's tensors, moments and statistics by the device's values."""

@@ -50,6 +50,15 @@ fn raise_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
     values[at] = max(values[at], parts[k / u.width]);
 }
 
+// Lower the columns of each splat, from column slot on, to at most its maximum in parts.
+@compute @workgroup_size(LANES)
+fn lower_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let k = group_of(group) * LANES + lane;
+    if (k >= u.count) { return; }
+    let at = k / u.width * u.stride + u.slot + k % u.width;
+    values[at] = min(values[at], parts[k / u.width]);
+}
+
 // Copy columns of values, from column slot on, to totals.
 @compute @workgroup_size(LANES)
 fn read_columns(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lane: u32) {
