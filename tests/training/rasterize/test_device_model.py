@@ -17,6 +17,7 @@ from training.rasterize import (
     rasterize,
     warm_up,
 )
+from training.rasterize.cuda.adam import update as update_on_gpu
 from training.rasterize.gpu import device_model, recording
 
 RATES = {
@@ -157,6 +158,31 @@ def test_steps_in_place_equal_steps_through_torch(in_place, make_splats, odd_cam
         tensors = [tensor.detach() for tensor in adam.tensors.values()]
         results.append([*tensors, *moments, *stats.values(), torch.tensor(losses)])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_steps_of_cuda_copy_nothing_that_waits(fake_card, make_splats, odd_camera, photo, monkeypatch):
+    """A blocking copy from the host would wait for all kernels of the step, as would a scalar's."""
+    adam, copies = adam_of(make_splats(50)), []
+    model = make_step_model("cuda", adam, zero_stats(50), antialias=True)
+    assert model is not None
+    target = Target(photo.image, mask=torch.rand(50, 75))
+    model.step(odd_camera, target, StepOptions(shrink=1, **VIEW))  # caches photo and mask
+    to, as_tensor = torch.Tensor.to, torch.as_tensor
+
+    def noted_to(*args, **options):
+        copies.append(options.get("non_blocking", False))
+        return to(*args, **options)
+
+    def noted_as_tensor(*args, **options):
+        copies.append("device" not in options)
+        return as_tensor(*args, **options)
+
+    monkeypatch.setattr(torch.Tensor, "to", noted_to)
+    monkeypatch.setattr(torch, "as_tensor", noted_as_tensor)
+    model.step(odd_camera, target, StepOptions(shrink=1, **VIEW))
+    sh = adam.tensors["sh"].detach()
+    update_on_gpu(sh, sh, *adam.state["sh"], RATES["sh"], adam.betas, adam.eps, 1)
+    assert copies and all(copies)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])

@@ -28,7 +28,9 @@ def update(
         rate = float(lr)
     else:
         row = parameter.shape[1:]
-        rates = torch.as_tensor(lr, dtype=torch.float32).to(parameter.device).expand(row).contiguous()
+        # a blocking copy would wait for the whole step
+        rates = torch.as_tensor(lr, dtype=torch.float32).to(parameter.device, non_blocking=True)
+        rates = rates.expand(row).contiguous()
         width = rates.numel()
     first, second = (1 - beta**step for beta in betas)
     count = parameter.numel()

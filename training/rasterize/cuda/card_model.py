@@ -12,7 +12,7 @@ from ..adam import Adam
 from ..gaussians import Gaussians
 from ..rendering import KernelCamera, RasterSettings, StepOptions, Target
 from ..stats import accumulate_stats
-from .frame import CardFrame, PhotometricLoss, upload_photo
+from .frame import CardFrame, PhotometricLoss, upload_mask, upload_photo
 
 TENSORS = tuple(field.name for field in fields(Gaussians))
 
@@ -43,7 +43,7 @@ class CardModel:
         image = frame.blend(frame.projected.colors, options.background)
         target = target.over(options.background)
         photo = upload_photo(target, image)
-        mask = None if target.mask is None else target.mask.to(image)[..., None]
+        mask = upload_mask(target, image)
         compared = image if mask is None else photo + mask * (image - photo)
         loss = PhotometricLoss(compared, photo, options.ssim_weight)
         by_image = loss.gradient(image.new_ones(()))

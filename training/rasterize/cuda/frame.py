@@ -26,6 +26,13 @@ def upload_photo(target: Target, like: torch.Tensor) -> torch.Tensor:
     return target.cache["cuda"]
 
 
+def upload_mask(target: Target, like: torch.Tensor) -> torch.Tensor | None:
+    """Return the photo's mask (H, W, 1) on the device of a tensor, or None; cached in the target."""
+    if target.mask is not None and "cuda_mask" not in target.cache:
+        target.cache["cuda_mask"] = target.mask.to(like)[..., None]
+    return target.cache.get("cuda_mask")
+
+
 def image_structure(view: KernelCamera, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
     """Return the structure ``Image`` of a view."""
     return struct.pack("=3f3i", *background, view.width, view.height, -(-view.width // TILE))
@@ -65,9 +72,10 @@ class Projected(NamedTuple):
             gaussians.sh.shape[1], settings.degree,
         )  # fmt: skip
         filters = None
-        if antialias is not False:
-            flags = torch.as_tensor(antialias, dtype=torch.uint8, device=means.device)
-            filters = flags.expand(count).contiguous()
+        if isinstance(antialias, torch.Tensor):
+            filters = antialias.to(means.device, torch.uint8).contiguous()
+        elif antialias:
+            filters = means.new_ones(count, dtype=torch.uint8)
         empty = means.new_empty
         projected = cls(
             view, filters, empty(count, ROW), empty(count, 3), empty(count), empty(count),
