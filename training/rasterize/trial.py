@@ -20,6 +20,7 @@ from . import (
     Gaussians,
     StepOptions,
     Target,
+    cpu_fallback_reason,
     cuda,
     make_step_model,
     photometric_loss,
@@ -53,6 +54,18 @@ def working_backends() -> list[str]:
     return names
 
 
+def card_problem() -> str:
+    """Return why the graphics card cannot train; empty if it can, or if there is none."""
+    try:
+        adapter = default_adapter()
+    except LodgsError:
+        return ""
+    try:
+        return "" if adapter.software else cpu_fallback_reason("gpu")
+    except LodgsError as problem:  # lost or out of memory
+        return f"{adapter.name} is not used. {problem}"
+
+
 def step_times() -> dict[str, float]:
     """Return milliseconds of a training step by working backend; empty if only the CPU works.
 
@@ -71,7 +84,7 @@ def step_times() -> dict[str, float]:
     for name in names:
         try:
             times[name] = round(1e3 * step_seconds(name), 2)
-        except LodgsError:  # lost or out of memory
+        except (LodgsError, RuntimeError):  # lost or out of memory; torch raises RuntimeError
             continue
     if set(times) == set(names):
         store_result(RESULTS, key, times)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from ..methods import METHODS
 from ..rasterize import cpu_fallback_reason, resolve_backend
 from ..rasterize.gpu.default_device import default_adapter
-from ..rasterize.trial import fastest_backend, step_times
+from ..rasterize.trial import card_problem, fastest_backend, step_times
 from ..scenes.colmap import Scene
 from .events import EventWriter
 from .job import Job
@@ -40,13 +40,16 @@ def trains_on_device(job: Job, scene: Scene) -> bool:
     return METHODS[job.method].trains_on_device(parameters)
 
 
-def report_backend(requested: str, backend: str, events: EventWriter) -> None:
-    """Report the backend, and the reason if an existing GPU is not used."""
+def report_backend(job: Job, scene: Scene, backend: str, events: EventWriter) -> None:
+    """Report the backend of a job, and the reason if an existing GPU is not used."""
     names = {"cpu": "the CPU", "cuda": "the NVIDIA GPU", "reference": "the CPU (slow reference rasterizer)"}
-    if problem := cpu_fallback_reason(requested):
+    problem = cpu_fallback_reason(job.backend)
+    if not problem and job.backend == "auto" and backend == "cpu" and trains_on_device(job, scene):
+        problem = card_problem()
+    if problem:
         events("warning", message=problem)
     name = names.get(backend) or default_adapter().name
-    if requested == "auto" and backend == "gpu":
+    if job.backend == "auto" and backend == "gpu":
         times = step_times()
         name += f": a step of a trial took {times['gpu']:.1f} ms, and {times['cpu']:.1f} ms on the CPU"
     events("status", message=f"Training on {name}", backend=backend)

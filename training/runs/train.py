@@ -153,7 +153,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         keep_freed_memory()
         backend = choose_backend(job, data.scene, lambda: data.transparent)
         warm_up(backend)
-        report_backend(job.backend, backend, events)
+        report_backend(job, data.scene, backend, events)
         if merged_is_result:
             _write_merged_levels(folder, events, data, backend, started)
             return DONE

@@ -217,12 +217,19 @@ def test_auto_never_trains_on_software_or_a_wrong_device(set_adapters, set_times
     assert trial.fastest_backend() == "cpu" and not measured
 
 
-def test_device_that_fails_its_trial_is_not_used(set_adapters, monkeypatch):
+@pytest.mark.parametrize(
+    "error",
+    [
+        LodgsError("GeForce RTX 4070 Laptop is out of memory."),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB."),
+    ],
+)
+def test_device_that_fails_its_trial_is_not_used(set_adapters, monkeypatch, error):
     set_adapters(CARD)
 
     def step_seconds(backend: str) -> float:
         if backend == "gpu":
-            raise LodgsError("GeForce RTX 4070 Laptop is out of memory.")
+            raise error
         return 0.05
 
     monkeypatch.setattr(trial, "step_seconds", step_seconds)

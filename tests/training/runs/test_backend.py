@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from training.errors import LodgsError
 from training.methods import METHODS, create
+from training.rasterize import trial
+from training.rasterize.gpu.device import Adapter
 from training.runs import backend
 from training.runs.job import Job
 from training.scenes.colmap import read_scene
@@ -45,6 +48,36 @@ def test_auto_trains_masked_and_transparent_photos_on_the_cpu(fast_card, tiny_sc
     assert backend.choose_backend(job, scene, lambda: True) == "cpu"
     masked = replace(scene.cameras[0], mask=tmp_path / "mask.png")
     assert backend.choose_backend(job, replace(scene, cameras=[masked, *scene.cameras[1:]])) == "cpu"
+
+
+@pytest.mark.parametrize(("method", "reported"), [("3dgs", True), ("lodge", False)])
+def test_auto_reports_a_card_that_fails_its_self_test(tiny_scene, tmp_path, monkeypatch, method, reported):
+    """Only jobs that the card could train alone look at it."""
+    card = Adapter("Radeon 780M", "integrated", "Vulkan", "radv 24.1")
+    for module in ("training.rasterize.gpu.default_device", "training.rasterize.trial"):
+        monkeypatch.setattr(f"{module}.default_adapter", lambda: card)
+    monkeypatch.setattr("training.rasterize.self_test.find_failure", lambda adapter: "its images are 3% off")
+    scene, messages = read_scene(tiny_scene), []
+    job = Job(scene=str(tiny_scene), out=str(tmp_path), method=method)
+    chosen = backend.choose_backend(job, scene)
+    backend.report_backend(job, scene, chosen, lambda kind, **values: messages.append(values["message"]))
+    problem = (
+        "Radeon 780M is not used: its images are 3% off. The CPU is used instead; a newer driver may help."
+    )
+    assert chosen == "cpu" and messages == [problem] * reported + ["Training on the CPU"]
+
+
+def test_auto_reports_a_card_that_was_lost_in_its_self_test(monkeypatch):
+    def lost(adapter):
+        raise LodgsError("Radeon 780M stopped responding: lost.", "Install a newer driver.")
+
+    card = Adapter("Radeon 780M", "integrated", "Vulkan", "radv 24.1")
+    for module in ("training.rasterize.gpu.default_device", "training.rasterize.trial"):
+        monkeypatch.setattr(f"{module}.default_adapter", lambda: card)
+    monkeypatch.setattr("training.rasterize.self_test.find_failure", lost)
+    assert trial.card_problem() == (
+        "Radeon 780M is not used. Radeon 780M stopped responding: lost. Install a newer driver."
+    )
 
 
 @pytest.mark.parametrize("name", METHODS)
