@@ -5,15 +5,17 @@ cpu; the share of the device's measured peak of multiply-adds and copies; and by
 Writes build/bench/gpu.json. Results of a software device are only sanity checks.
 
 ``--all`` measures everything in less than ten minutes on a card that is at hand for a short time: devices,
-drivers and versions; the first step in a new process; the above; steps of ``cuda``, and of gsplat where it is
-installed; trainings of ``examples/lantern_garden``; and their PSNR with three seeds per backend. The file is
-written after each part. ``--tiny`` tries the script.
+drivers and versions; the self-tests; the first step in a new process; the above; steps of ``cuda``, and of
+gsplat where it is installed; trainings of ``examples/lantern_garden``; and their PSNR with three seeds per
+backend. Each part has a process of its own, so a part that fails, crashes or hangs leaves the others
+unchanged. The file is written after each part. ``--tiny`` tries the script.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import platform
 import shutil
@@ -25,9 +27,11 @@ import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +54,7 @@ from training.rasterize import (  # noqa: E402
     Gaussians,
     StepOptions,
     Target,
+    cpu_fallback_reason,
     cuda,
     make_step_model,
     photometric_loss,
@@ -59,7 +64,7 @@ from training.rasterize import (  # noqa: E402
 )
 from training.rasterize.gpu import scene  # noqa: E402
 from training.rasterize.gpu.default_device import open_default_device  # noqa: E402
-from training.rasterize.gpu.device import LANES, Device  # noqa: E402
+from training.rasterize.gpu.device import LANES, Device, adapters  # noqa: E402
 from training.rasterize.gpu.device_model import GpuModel  # noqa: E402
 
 CASES = [(50_000, 640, 426), (200_000, 960, 540), (1_000_000, 1920, 1080), (3_000_000, 1920, 1080)]
@@ -75,10 +80,12 @@ WORDS, ROUNDS, GROUPS = 1 << 24, 4096, 1024
 TINY = [(2_000, 160, 120)]
 """Cases of ``--tiny``."""
 EXAMPLE = ROOT / "examples" / "lantern_garden"
-TRAINING_SECONDS = 120
-"""Time limit of a training of ``--all``."""
+PART_SECONDS = 120
+"""Time limit of a part of ``--all``."""
 TOTAL_SECONDS = 570
 """Time after which ``--all`` skips its remaining parts."""
+PASSED = "passed"
+"""Result of a self-test."""
 SEEDS = 0, 1, 2
 """Seeds of the trainings whose PSNR is compared."""
 STEPS = 16
@@ -209,69 +216,83 @@ def stages_of(device: Device, step: Callable[[], object]) -> dict[str, float]:
     return {stage: round(ms, 2) for stage, ms in spent.items()}
 
 
+def seconds_per_step(step: Callable[[], Callable[[], float]], fastest: Fastest) -> float:
+    """Measure steps as in training, whose loss is rarely read."""
+
+    def many_steps() -> None:
+        for loss in [step() for _ in range(STEPS)][-1:]:
+            loss()
+
+    return fastest(many_steps) / STEPS
+
+
+def device_steps(size: tuple[int, int, int], fastest: Fastest) -> dict:
+    """Measure steps of gpu: time, recording, stages and bytes."""
+    device, case = open_default_device(), Case(*size)
+    step = case.without_autograd("gpu")
+    return {
+        "step_ms": round(1e3 * seconds_per_step(step, fastest), 2),
+        "recording": recording_of(device, step),
+        "bytes_moved": transferred_bytes(device, step),
+        "stages_ms": stages_of(device, case.without_autograd("gpu", recorded=False)),
+    }
+
+
+def copied_steps(size: tuple[int, int, int], fastest: Fastest) -> dict:
+    """Measure steps of gpu that copy splats and gradients: time and bytes."""
+    device, case = open_default_device(), Case(*size)
+    seconds = fastest(lambda: case.through_torch("gpu"))
+    moved = transferred_bytes(device, lambda: case.through_torch("gpu"))
+    return {"copied_step_ms": round(1e3 * seconds, 2), "copied_bytes_moved": moved}
+
+
+def cpu_steps(size: tuple[int, int, int], fastest: Fastest) -> dict:
+    """Measure steps of the cpu."""
+    return {"cpu_step_ms": round(1e3 * fastest(Case(*size).without_autograd("cpu")), 2)}
+
+
 def bench(seconds: float, cases: list[tuple[int, int, int]] | None = None) -> dict:
     """Measure cases; None measures CASES, but only the first on a software device."""
     device, fastest = open_default_device(), Fastest(seconds)
     warm_up("gpu")
     flops, bandwidth = peaks(device, fastest)
     print(f"{device.adapter.name}: {flops:.0f} GFLOP/s of multiply-adds, copies {bandwidth:.1f} GB/s")
-    sizes, cases = cases or CASES[: 1 if device.adapter.software else None], []
+    sizes, results = cases or CASES[: 1 if device.adapter.software else None], []
     for size in sizes:
-        case = Case(*size)
-        copied = fastest(lambda case=case: case.through_torch("gpu"))
-        cpu = fastest(case.without_autograd("cpu"))
-        copied_bytes = transferred_bytes(device, lambda case=case: case.through_torch("gpu"))
-        step = case.without_autograd("gpu")
-
-        def many_steps(step: Callable[[], Callable[[], float]] = step) -> None:
-            for loss in [step() for _ in range(STEPS)][-1:]:
-                loss()
-
-        device_seconds, bytes_moved = fastest(many_steps) / STEPS, transferred_bytes(device, step)
-        recording = recording_of(device, step)
-        stages = stages_of(device, case.without_autograd("gpu", recorded=False))
+        result = {"splats": size[0], "width": size[1], "height": size[2]}
+        for measure in (device_steps, copied_steps, cpu_steps):
+            result |= measure(size, fastest)
+        stages = result["stages_ms"]
         numbers = size[0] * (scene.SPLAT - 2 + 48)
         adam_bandwidth = BYTES_PER_NUMBER * numbers / (stages["adam"] / 1e3) / 1e9
         lanes, _ = work(Step(*size))
         blending = (stages["blend"] + stages["blend_backward"]) / 1e3
         blended = lanes * (FORWARD_FLOPS + BACKWARD_FLOPS) / 1e9 / blending
-        result = {
-            "splats": size[0], "width": size[1], "height": size[2],
-            "step_ms": round(1e3 * device_seconds, 2), "copied_step_ms": round(1e3 * copied, 2),
-            "cpu_step_ms": round(1e3 * cpu, 2), "over_cpu": round(device_seconds / cpu, 2),
-            "recording": recording, "stages_ms": stages, "bytes_moved": bytes_moved,
-            "copied_bytes_moved": copied_bytes,
+        result |= {
+            "over_cpu": round(result["step_ms"] / result["cpu_step_ms"], 2),
             "blending_share_of_peak": round(blended / flops, 3),
             "adam_share_of_copies": round(adam_bandwidth / bandwidth, 3),
-        }  # fmt: skip
+        }
         print(json.dumps(result))
-        cases.append(result)
-    adapter = device.adapter._asdict()
+        results.append(result)
     return {
-        "device": adapter,
+        "device": device.adapter._asdict(),
         "peak_gflops": round(flops, 1),
         "copy_gb_s": round(bandwidth, 1),
-        "cases": cases,
+        "cases": results,
     }
 
 
-def cuda_seconds(size: tuple[int, int, int], fastest: Fastest) -> dict[str, float]:
-    """Measure a step of cuda; with gsplat, also its step with a torch SSIM and torch's fused Adam.
+def cuda_steps(size: tuple[int, int, int], fastest: Fastest) -> dict:
+    """Measure steps of cuda. This has not run yet: it needs an NVIDIA GPU."""
+    step = Case(*size, device="cuda").without_autograd("cuda")
+    milliseconds = 1e3 * seconds_per_step(step, fastest)
+    return {"cuda_step_ms": round(milliseconds, 2), "peak_mb": torch.cuda.max_memory_allocated() >> 20}
 
-    This part has not run yet: it needs an NVIDIA GPU.
-    """
-    case = Case(*size, device="cuda")
 
-    step = case.without_autograd("cuda")
-
-    def step_cuda() -> None:
-        step()
-        torch.cuda.synchronize()
-
-    steps = {"cuda_step_ms": step_cuda}
-    if find_spec("gsplat"):
-        steps["gsplat_step_ms"] = gsplat_step(case)
-    return {name: round(1e3 * fastest(step), 2) for name, step in steps.items()}
+def gsplat_steps(size: tuple[int, int, int], fastest: Fastest) -> dict:
+    """Measure steps of gsplat with a torch SSIM and torch's fused Adam."""
+    return {"gsplat_step_ms": round(1e3 * fastest(gsplat_step(Case(*size, device="cuda"))), 2)}
 
 
 def gsplat_step(case: Case) -> Callable[[], None]:
@@ -303,44 +324,53 @@ def first_step_seconds(backend: str) -> float:
     """Measure a new process until the end of its first step."""
     code = f"from training.rasterize import warm_up; warm_up({backend!r})"
     begin = time.perf_counter()
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=TRAINING_SECONDS)
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=PART_SECONDS)
     return round(time.perf_counter() - begin, 1)
 
 
-def training(backend: str, options: list[str], seconds: float = TRAINING_SECONDS) -> dict:
-    """Train the example; return the last values of its events.
-
-    Raises:
-        subprocess.TimeoutExpired: the training took longer than ``seconds``.
-    """
+def training(backend: str, options: list[str], seconds: float = PART_SECONDS) -> dict:
+    """Train the example for a limited time; return the last values of its events."""
+    begin, result = time.perf_counter(), {}
     with tempfile.TemporaryDirectory() as folder:
         files = ["--scene", str(EXAMPLE), "--out", f"{folder}/run"]
         command = [sys.executable, "-m", "training", "train", *files, "--backend", backend, *options]
-        begin = time.perf_counter()
-        ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=seconds)
-    events = [json.loads(line) for line in ended.stdout.splitlines() if line.startswith("{")]
-    kinds = {event["event"]: event for event in events}
-    progress, done = kinds.get("progress", {}), kinds.get("done", {})
-    result = {name: progress.get(name) for name in ("step", "splats", "steps_per_s", "psnr")}
-    result |= {"seconds": round(time.perf_counter() - begin, 1), "code": ended.returncode, "done": done}
-    return result | ({"error": kinds["error"]} if "error" in kinds else {})
+        try:
+            ended = subprocess.run(command, cwd=ROOT, capture_output=True, timeout=seconds)
+            output, result["code"] = ended.stdout, ended.returncode
+            if ended.returncode:
+                result["log"] = ended.stderr.decode(errors="replace")[-2000:]
+        except subprocess.TimeoutExpired as stopped:
+            output, result["code"] = stopped.stdout or b"", f"stopped after {seconds:.0f} s"
+    lines = [line for line in output.splitlines() if line.startswith(b"{") and line.endswith(b"}")]
+    kinds = {event["event"]: event for event in map(json.loads, lines)}
+    progress = kinds.get("progress", {})
+    result |= {name: progress.get(name) for name in ("step", "splats", "steps_per_s", "psnr")}
+    result |= {name: kinds[name] for name in ("done", "error") if name in kinds}
+    return result | {"seconds": round(time.perf_counter() - begin, 1)}
 
 
-def compare_seeds(backends: list[str], options: list[str], left: Callable[[], float]) -> dict:
-    """Train with each seed and backend; return PSNR, and the largest difference of a mean from cpu's.
+def compare_seeds(results: dict[str, object]) -> dict:
+    """Return the PSNR of trainings by backend, and the largest difference of a mean from cpu's.
 
     Args:
-        left: returns the time limit of the next training in seconds. Seeds beyond it are left out.
+        results: parts by name. Seeds that not all backends completed are left out of the means.
     """
-    psnr: dict[str, list[float]] = {name: [] for name in ("cpu", *backends)}
-    with suppress(subprocess.TimeoutExpired):
-        for seed in SEEDS:
-            for name, values in psnr.items():
-                values.append(training(name, [*options, "--seed", str(seed)], left())["psnr"])
-    count = min(map(len, psnr.values()))
-    means = {name: sum(values[:count]) / max(count, 1) for name, values in psnr.items()}
-    difference = max(abs(mean - means["cpu"]) for mean in means.values())
-    return {"psnr": psnr, "seeds": count, "largest_difference": round(difference, 3)}
+    psnr = {
+        backend: [
+            part["psnr"] if isinstance(part, dict) and part["code"] == 0 else None
+            for part in (results.get(_seed_label(seed, backend)) for seed in SEEDS)
+        ]
+        for backend in ("cpu", "gpu", "cuda")
+        if any(_seed_label(seed, backend) in results for seed in SEEDS)
+    }
+    complete = [values for values in zip(*psnr.values(), strict=True) if None not in values]
+    means = np.mean(complete, axis=0) if complete else np.zeros(0)
+    difference = round(float(np.abs(means - means[0]).max()), 3) if complete else None
+    return {"psnr": psnr, "seeds": len(complete), "largest_difference": difference}
+
+
+def _seed_label(seed: int, backend: str) -> str:
+    return f"seed {seed}, {backend}"
 
 
 def versions() -> dict[str, object]:
@@ -351,22 +381,103 @@ def versions() -> dict[str, object]:
     for name in ("torch", "wgpu", "numba", "gsplat"):
         with suppress(PackageNotFoundError):
             packages[name] = version(name)
+    try:
+        graphics: object = [adapter._asdict() for adapter in adapters()]
+    except LodgsError as problem:
+        graphics = str(problem)
     return {
         "lodgs": tomllib.loads((ROOT / "blender_manifest.toml").read_text("utf-8"))["version"],
         "python": platform.python_version(), "system": platform.platform(), "cores": os.cpu_count(),
         "packages": packages, "cuda": torch.version.cuda,
         "nvidia": subprocess.run([nvidia, *query], capture_output=True, text=True).stdout if nvidia else None,
-        "graphics": open_default_device().adapter._asdict(),
+        "graphics": graphics,
     }  # fmt: skip
 
 
-def measure_all(seconds: float, tiny: bool, out: Path) -> dict:
-    """Measure all parts of ``--all`` within TOTAL_SECONDS, and write the results so far after each.
+def check(backend: str) -> str:
+    """Run the self-test of a backend; return PASSED or the problem."""
+    if backend == "cuda":
+        return str(cuda.find_problem() or PASSED)
+    return cpu_fallback_reason(backend) or PASSED
 
-    The most important parts come first. When the time is over, the remaining parts are skipped.
+
+def peaks_of_default_device(fastest: Fastest) -> dict[str, float]:
+    """Return the rates of :func:`peaks`."""
+    flops, bandwidth = peaks(open_default_device(), fastest)
+    return {"peak_gflops": round(flops, 1), "copy_gb_s": round(bandwidth, 1)}
+
+
+def in_new_process(function: Callable[..., object], seconds: float) -> object:
+    """Call a function of a module in a new process; return its result.
+
+    Raises:
+        RuntimeError: the function raised an exception, the process ended or did not end in time.
     """
-    deadline = time.monotonic() + TOTAL_SECONDS
-    backends = ["gpu"] if cuda.find_problem() else ["gpu", "cuda"]
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send_result, args=(sender, function))
+    process.start()
+    sender.close()
+    try:
+        if not receiver.poll(seconds):
+            raise RuntimeError(f"stopped after {seconds:.0f} s")
+        succeeded, result = receiver.recv()
+    except EOFError:
+        process.join()
+        raise RuntimeError(f"the process ended with code {process.exitcode}") from None
+    finally:
+        process.kill()
+        process.join()
+    if not succeeded:
+        raise RuntimeError(result)
+    return result
+
+
+def _send_result(sender: Connection, function: Callable[..., object]) -> None:
+    torch.set_num_threads(1)
+    try:
+        sender.send((True, function()))
+    except Exception as error:
+        sender.send((False, f"{type(error).__name__}: {error}"))
+
+
+class Parts:
+    """Parts of ``--all``, measured in turn until TOTAL_SECONDS are over.
+
+    Attributes:
+        results: results of the parts by name, or why there is none.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.results: dict[str, object] = {}
+        self._out = out
+        self._deadline = time.monotonic() + TOTAL_SECONDS
+        out.parent.mkdir(parents=True, exist_ok=True)
+
+    def measure(self, name: str, function: Callable[..., object]) -> None:
+        """Call a function in a new process, and write all results so far."""
+        self._measure(name, partial(in_new_process, function))
+
+    def train(self, name: str, backend: str, options: list[str]) -> None:
+        """Train the example, and write all results so far."""
+        self._measure(name, partial(training, backend, options))
+
+    def _measure(self, name: str, function: Callable[[float], object]) -> None:
+        begin = time.monotonic()
+        remaining = self._deadline - begin
+        try:
+            skipped = "skipped: the time is over"
+            self.results[name] = function(min(remaining, PART_SECONDS)) if remaining > 0 else skipped
+        except Exception as error:  # the other parts are measured
+            self.results[name] = f"failed: {error}"
+        print(f"{name}: {self.results[name]} ({time.monotonic() - begin:.0f} s)", flush=True)
+        self._out.write_text(json.dumps(self.results, indent=1) + "\n")
+
+
+def measure_all(seconds: float, tiny: bool, out: Path) -> dict[str, object]:
+    """Measure all parts of ``--all``, the most important ones first; return their results by name."""
+    parts, fastest = Parts(out), Fastest(seconds)
+    sizes = TINY if tiny else CASES
     jobs = {
         "flod draft, half size": ["--method", "flod"],
         "3dgs draft, full size": ["--method", "3dgs", "--image-scale", "1"],
@@ -375,50 +486,48 @@ def measure_all(seconds: float, tiny: bool, out: Path) -> dict:
     if tiny:
         jobs = {"3dgs, tiny": ["--method", "3dgs", "--image-scale", "0.1", "--set", "steps=20"]}
         seeds = jobs["3dgs, tiny"]
-
-    def left() -> float:
-        return max(min(deadline - time.monotonic(), TRAINING_SECONDS), 1.0)
-
-    parts: dict[str, Callable[[], object]] = {"versions": versions}
+    parts.measure("versions", versions)
+    for name in ("cuda", "gpu"):
+        parts.measure(f"check, {name}", partial(check, name))
+    backends = [name for name in ("cuda", "gpu") if parts.results[f"check, {name}"] == PASSED]
     for name in backends:
-        parts[f"first step, {name}"] = lambda name=name: first_step_seconds(name)
-    for size in CASES if "cuda" in backends else []:
-        label = f"steps, cuda, {size[0]:,} splats, {size[1]}x{size[2]}"
-        parts[label] = lambda size=size: cuda_seconds(size, Fastest(seconds))
-    parts["steps, gpu"] = lambda: bench(seconds, TINY if tiny else None)
+        parts.measure(f"first step, {name}", partial(first_step_seconds, name))
+    kinds = {"cuda": [cuda_steps], "gpu": [device_steps]}
+    if find_spec("gsplat"):
+        kinds["cuda"].append(gsplat_steps)
+    steps = [measure for name in backends for measure in kinds[name]] + [cpu_steps]
+    if "gpu" in backends:
+        steps.append(copied_steps)
+        parts.measure("peaks, gpu", partial(peaks_of_default_device, fastest))
+    for measure in steps:
+        for count, width, height in sizes:
+            label = f"{measure.__name__.replace('_', ' ')}, {count:,} splats, {width}x{height}"
+            parts.measure(label, partial(measure, (count, width, height), fastest))
     for job, options in jobs.items():
         for name in backends:
-            label = f"training, {name}, {job}"
-            parts[label] = lambda name=name, options=options: training(name, options, left())
-    parts["three seeds, PSNR"] = lambda: compare_seeds(backends, seeds, left)
-    results: dict[str, object] = {}
-    for name, measure in parts.items():
-        begin = time.monotonic()
-        try:
-            results[name] = measure() if begin < deadline else "skipped: the time is over"
-        except Exception as error:  # the other parts are measured
-            results[name] = f"{type(error).__name__}: {error}"
-        print(f"{name}: {results[name]} ({time.monotonic() - begin:.0f} s)", flush=True)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(results, indent=1) + "\n")
-    return results
+            parts.train(f"training, {name}, {job}", name, options)
+    for seed in SEEDS:
+        for name in ("cpu", *backends):
+            parts.train(_seed_label(seed, name), name, [*seeds, "--seed", str(seed)])
+    parts.measure("three seeds, PSNR", partial(compare_seeds, parts.results))
+    return parts.results
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=3.0, help="time limit per measurement")
+    parser.add_argument("--seconds", type=float, help="time limit per measurement (3, or 1 with --all)")
     parser.add_argument("--all", action="store_true", help="measure everything, also trainings")
     parser.add_argument("--tiny", action="store_true", help="try the script with tiny sizes")
     parser.add_argument("--out", type=Path, default=Path("build/bench/gpu.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.all:
+        measure_all(options.seconds or 1.0, options.tiny, options.out)
+        return
     try:
         if resolve_backend("gpu") != "gpu":
             raise LodgsError("The graphics device renders incorrectly.")
-        if options.all:
-            measure_all(options.seconds, options.tiny, options.out)
-            return
-        result = bench(options.seconds, TINY if options.tiny else None)
+        result = bench(options.seconds or 3.0, TINY if options.tiny else None)
     except LodgsError as problem:
         print(f"gpu: not measured. {problem}")
         return
