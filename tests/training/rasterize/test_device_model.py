@@ -362,6 +362,29 @@ def test_recorded_steps_need_no_private_functions(graphics, make_splats, odd_cam
     assert torch.equal(trained(), expected)
 
 
+def test_image_sizes_share_buffers(graphics, make_splats, odd_camera, photo):
+    """Steps on reduced images create only their photos and a number, with the bits of separate buffers."""
+    sizes = (75, 50), (40, 20), (17, 9)
+    views = [
+        (replace(odd_camera, width=width, height=height), Target(photo.image[:height, :width]))
+        for width, height in sizes
+    ]
+    results, created = [], []
+    for shared in (True, False):
+        model = make_step_model("gpu", adam_of(make_splats(300)), zero_stats(300))
+        assert model is not None
+        losses = []
+        for k in (0, 1, 2, 1, 0, 2):
+            if not shared:
+                model._forget_recordings()
+            before = graphics.counts.copy()
+            losses.append(model.step(*views[k], StepOptions(shrink=1, **VIEW)))
+            created.append((graphics.counts - before)["buffers"])
+        results.append([model.read("means"), model.read("sh"), torch.tensor([loss() for loss in losses])])
+    assert created[1:6] == [2, 2, 0, 0, 0] and min(created[6:]) > 10
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
 def test_lost_losses_are_reported_later(graphics, make_splats, odd_camera, photo):
     """A loss that is not finite is returned by all later steps, whose own loss may be finite again."""
     adam = adam_of(make_splats(50))

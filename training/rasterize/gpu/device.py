@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import LodgsError
-from .recording import Dispatch, Recording, encode
+from .recording import Dispatch, Recording, encode, words_of
 from .source import source_of
 
 KINDS = {"DiscreteGPU": "discrete", "IntegratedGPU": "integrated", "CPU": "software"}
@@ -219,27 +219,36 @@ class Device:
         """
         buffer = self.scratch(kind, *shape)
         if self._recording is not None:
-            self._recording.cleared.append(buffer.handle)
+            self._recording.cleared.append((buffer.handle, buffer.size))
         return buffer
 
     def scratch(self, kind: type, *shape: int) -> Buffer:
-        """Create a buffer of any content, for shaders that write all of it; LodgsError as in `empty`."""
+        """Create a buffer of any content, for shaders that write all of it; LodgsError as in `empty`.
+
+        In :meth:`record` it may be a buffer of another recording.
+        """
+        size = 4 * math.prod(shape)
+        create, recording = self._create_buffer, self._recording
+        handle = create(size) if recording is None else recording.take_buffer(size, create)
+        return Buffer(handle, shape, np.dtype(kind))
+
+    def _create_buffer(self, size: int) -> Any:
+        size = max(size, MIN_BUFFER_BYTES)
+        self._require(size, self.buffer_bytes)
         flags = _wgpu().BufferUsage
         usage = flags.STORAGE | flags.COPY_SRC | flags.COPY_DST
-        size = max(int(np.prod(shape, dtype=np.int64)) * 4, MIN_BUFFER_BYTES)
-        self._require(size, self.buffer_bytes)
         with self._translate_errors():
             handle = self._device.create_buffer(size=size, usage=usage)
         self.counts["buffers"] += 1
-        return Buffer(handle, shape, np.dtype(kind))
+        return handle
 
     def upload(self, array: np.ndarray) -> Buffer:
         """Copy an array of 4-byte numbers to the device; LodgsError as in :meth:`empty`."""
         array = np.ascontiguousarray(array)
-        buffer = self.scratch(array.dtype.type, *array.shape)
+        handle = self._create_buffer(array.nbytes)
         if array.size:
-            self._write(buffer.handle, array)
-        return buffer
+            self._write(handle, array)
+        return Buffer(handle, array.shape, array.dtype)
 
     def write(self, buffer: Buffer, array: np.ndarray) -> None:
         """Replace a buffer's content after all recorded dispatches; LodgsError as in :meth:`read`."""
@@ -320,7 +329,7 @@ class Device:
                     if numbers and (first == begin or not self._number_count):
                         bound[bindings["u"]] = self._uniform(*numbers)
                 elif numbers and first == begin:
-                    uniform = bindings["u"], *self._recording.add_numbers(numbers, _words(numbers))
+                    uniform = bindings["u"], *self._recording.add_numbers(numbers, words_of(numbers))
                 bound[bindings["first_group"]] = self._first_group(first)
                 self._dispatch(
                     Dispatch(pipeline, layout, dict(bound), uniform, min(chunk, begin + groups - first))
@@ -329,14 +338,17 @@ class Device:
                     self.submit()
 
     @contextmanager
-    def record(self) -> Iterator[Recording]:
+    def record(self, shared: list[Any]) -> Iterator[Recording]:
         """Prepare the dispatches of a block for :meth:`replay` instead of running them.
 
         Buffers that the block creates with :meth:`empty` are cleared before each replay. It cannot read.
+
+        Args:
+            shared: buffers that recordings share, see :class:`Recording`.
         """
         self.submit()
         aligned = self.limits["min-uniform-buffer-offset-alignment"] // 4
-        recording = self._recording = Recording(aligned)
+        recording = self._recording = Recording(aligned, shared)
         try:
             yield recording
         finally:
@@ -422,7 +434,7 @@ class Device:
         if first not in self._first_groups:
             usage = _wgpu().BufferUsage.UNIFORM
             self._first_groups[first] = self._device.create_buffer_with_data(
-                data=_words((first,)), usage=usage
+                data=words_of((first,)), usage=usage
             )
         return {"buffer": self._first_groups[first]}
 
@@ -440,7 +452,7 @@ class Device:
 
         If the uniform buffer is full, recorded dispatches are submitted first.
         """
-        words = _words(numbers)
+        words = words_of(numbers)
         aligned = self.limits["min-uniform-buffer-offset-alignment"] // 4
         if self._number_count + len(words) > len(self._numbers):
             self.submit()
@@ -484,17 +496,3 @@ class Device:
                 f"{name} stopped responding: {_reason(error)}.",
                 "Resume the run on this device or on the cpu; a newer driver may help.",
             ) from error
-
-
-def _words(numbers: tuple) -> np.ndarray:
-    """Convert numbers to the words of a uniform, padded to vectors of four."""
-    parts = [_as_words(number) for number in numbers]
-    count = sum(map(len, parts))
-    words = np.zeros(-(-count // 4) * 4, np.uint32)
-    np.concatenate(parts, out=words[:count])
-    return words
-
-
-def _as_words(number: Any) -> np.ndarray:
-    array = np.atleast_1d(np.asarray(number)).reshape(-1)
-    return array.astype(np.float32 if array.dtype.kind == "f" else np.uint32).view(np.uint32)

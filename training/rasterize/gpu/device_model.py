@@ -12,6 +12,7 @@ notices when it reads losses, enlarges the buffers and repeats these steps, with
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,8 +42,8 @@ STATE = ("_splats", "_sh", "_moments", "_stat_sums")
 
 PENDING = 32
 """Maximum number of steps whose losses the host has not read."""
-RECORDINGS = 2
-"""Maximum number of recorded steps, which differ in image size or degree. Each has buffers of its own."""
+RECORDINGS = 8
+"""Maximum number of recorded steps, which differ in image size or degree. They share buffers."""
 PAIRS_PER_SPLAT, MIN_PAIRS, GROWTH = 4, 1 << 14, 1.5
 """Initial capacity for pairs, and its growth over the number of pairs of a step that has more."""
 
@@ -109,6 +110,7 @@ class GpuModel:
         self._rates["sh"] = rates[TRAINED:].reshape(-1, 3, 2)
         self._pending: list[Step] = []
         self._recorded: dict[tuple, Inputs] = {}
+        self._shared: list[Any] = []  # buffers of all recorded steps
         self._diverged: float | None = None
         self._max_pairs = device.binding_bytes // (4 * PAIR_SUMS)
         self._capacity: int | None = min(max(PAIRS_PER_SPLAT * count, MIN_PAIRS), self._max_pairs)
@@ -160,7 +162,7 @@ class GpuModel:
         """Prepare the dispatches of a step."""
         if len(self._recorded) == RECORDINGS:
             self._recorded.pop(next(iter(self._recorded)))
-        with self.device.record() as recording:
+        with self.device.record(self._shared) as recording:
             inputs = self._dispatch(step, self._capacity)
         inputs.recording = recording
         return inputs
@@ -215,7 +217,7 @@ class GpuModel:
             if needed:
                 fits = needed <= self._max_pairs
                 self._capacity = min(int(GROWTH * needed), self._max_pairs) if fits else None
-                self._recorded.clear()
+                self._forget_recordings()
             for step in repeated:
                 self._start(step)
 
@@ -275,7 +277,7 @@ class GpuModel:
             uploaded = device.upload(values.numpy())
             columns = COLUMNS.get(name) or slice(TRAINED, self._moments.shape[1])
             if name == "sh":
-                self._recorded.clear()
+                self._forget_recordings()
                 self._sh = uploaded
             else:
                 self._run("write_columns", columns, parts=uploaded, values=self._splats)
@@ -323,10 +325,14 @@ class GpuModel:
     def _replace_state(self, make: Callable[[str, Buffer], Buffer]) -> None:
         """Replace the buffers of STATE one by one, so that at most one exists twice."""
         self._settle()
-        self._recorded.clear()
+        self._forget_recordings()
         for name in STATE:
             setattr(self, name, make(name, getattr(self, name)))
             self.device.wait()
+
+    def _forget_recordings(self) -> None:
+        self._recorded.clear()
+        self._shared.clear()
 
     def _select_rows(self, buffer: Buffer, index: Buffer) -> Buffer:
         """Copy the rows of a buffer at indices (M,)."""

@@ -49,26 +49,42 @@ class Recording:
 
     Arrays among the numbers are read again before each replay, so their owner changes them in place.
 
+    Args:
+        alignment: words between the beginnings of two dispatches' numbers.
+        shared: wgpu's buffers that recordings share, which are replayed one after another. New ones are
+            added.
+
     Attributes:
-        cleared: wgpu's buffers to clear.
+        cleared: wgpu's buffers to clear, and their number of bytes.
         parts: pipelines, bind groups and numbers of workgroups, by submission.
         count: number of dispatches.
         uniforms: wgpu's buffer of all numbers.
         native: pointers of wgpu-native in the form of :data:`Pointers`, once they are needed.
     """
 
-    def __init__(self, alignment: int) -> None:
-        self.cleared: list[Any] = []
+    def __init__(self, alignment: int, shared: list[Any]) -> None:
+        self.cleared: list[tuple[Any, int]] = []
         self.parts: list[list[tuple[Any, Any, int]]] = []
         self.count = 0
         self.uniforms: Any = None
         self.native: Pointers | None = None
         self._alignment = alignment
+        self._shared, self._free = shared, list(shared)
         self._dispatches: list[list[Dispatch]] = [[]]
         self._words: list[np.ndarray] = []
         self._size = 0
         self._arrays: list[tuple[int, np.ndarray]] = []
         self._numbers = np.zeros(0, np.uint32)
+
+    def take_buffer(self, size: int, create: Callable[[int], Any]) -> Any:
+        """Return the smallest shared buffer of at least ``size`` bytes that is not in use, or a new one."""
+        fitting = [buffer for buffer in self._free if buffer.size >= size]
+        if not fitting:
+            self._shared.append(create(size))
+            return self._shared[-1]
+        smallest = min(fitting, key=lambda buffer: buffer.size)
+        self._free.remove(smallest)
+        return smallest
 
     def add(self, dispatch: Dispatch) -> None:
         """Append a dispatch."""
@@ -104,7 +120,7 @@ class Recording:
                 part.append((pipeline, create_bind_group(layout=layout, entries=entries), groups))
             self.parts.append(part)
             self.count += len(part)
-        self._dispatches, self._words = [], []
+        self._dispatches, self._words, self._free = [], [], []
 
     def replay(self, device: Any, copies: list[Copy]) -> None:
         """Submit the dispatches to wgpu's device, after copies of buffers."""
@@ -115,6 +131,20 @@ class Recording:
         for begin, array in self._arrays:
             self._numbers[begin : begin + array.size] = array.view(np.uint32)
         return self._numbers
+
+
+def words_of(numbers: tuple) -> np.ndarray:
+    """Convert numbers to the words of a uniform, padded to vectors of four."""
+    parts = [_as_words(number) for number in numbers]
+    count = sum(map(len, parts))
+    words = np.zeros(-(-count // 4) * 4, np.uint32)
+    np.concatenate(parts, out=words[:count])
+    return words
+
+
+def _as_words(number: Any) -> np.ndarray:
+    array = np.atleast_1d(np.asarray(number)).reshape(-1)
+    return array.astype(np.float32 if array.dtype.kind == "f" else np.uint32).view(np.uint32)
 
 
 def encode(compute_pass: Any, dispatches: Iterable[tuple[Any, Any, int]]) -> None:
@@ -131,8 +161,8 @@ def _replay(recording: Recording, device: Any, copies: list[Copy]) -> None:
     encoder = device.create_command_encoder()
     for copy in copies:
         encoder.copy_buffer_to_buffer(*copy)
-    for handle in recording.cleared:
-        encoder.clear_buffer(handle)
+    for handle, size in recording.cleared:
+        encoder.clear_buffer(handle, 0, size)
     for part in recording.parts:
         encoder = encoder or device.create_command_encoder()
         compute_pass = encoder.begin_compute_pass()
@@ -163,7 +193,7 @@ def _native_replay() -> Callable[[Recording, Any, list[Copy]], None] | None:
     def pointers(recording: Recording) -> Pointers:
         return (
             recording.uniforms._internal,
-            [(buffer._internal, buffer.size) for buffer in recording.cleared],
+            [(buffer._internal, size) for buffer, size in recording.cleared],
             [
                 [(pipeline._internal, group._internal, n) for pipeline, group, n in part]
                 for part in recording.parts
