@@ -471,6 +471,10 @@ class Parts:
         except Exception as error:  # the other parts are measured
             self.results[name] = f"failed: {error}"
         print(f"{name}: {self.results[name]} ({time.monotonic() - begin:.0f} s)", flush=True)
+        self.write()
+
+    def write(self) -> None:
+        """Write all results so far."""
         self._out.write_text(json.dumps(self.results, indent=1) + "\n")
 
 
@@ -509,7 +513,8 @@ def measure_all(seconds: float, tiny: bool, out: Path) -> dict[str, object]:
     for seed in SEEDS:
         for name in ("cpu", *backends):
             parts.train(_seed_label(seed, name), name, [*seeds, "--seed", str(seed)])
-    parts.measure("three seeds, PSNR", partial(compare_seeds, parts.results))
+    parts.results["three seeds, PSNR"] = compare_seeds(parts.results)
+    parts.write()
     return parts.results
 
 
