@@ -260,6 +260,15 @@ def test_zero_weight_removes_splat(backend, make_splats, odd_camera):
     assert weighted.radii[weights == 0].max() == 0
 
 
+@pytest.mark.parametrize("name", ["means", "quats"])
+def test_splats_that_are_not_numbers_are_not_drawn(kernels, make_splats, odd_camera, name):
+    splats = make_splats(60).to(dtype=torch.float32)
+    getattr(splats, name)[7] = float("nan")
+    drawn = rasterize(splats, odd_camera, backend=kernels)
+    expected = rasterize(splats.select(torch.arange(60) != 7), odd_camera, backend=kernels)
+    assert drawn.radii[7] == 0 and torch.equal(drawn.image, expected.image)
+
+
 def test_unselected_rows_act_like_zero_weights(backend, make_splats, odd_camera):
     splats = make_splats(300).to(dtype=torch.float32)
     weights = torch.rand(300, generator=torch.Generator().manual_seed(1))

@@ -151,7 +151,7 @@ fn forward(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let yy = e.vv + dilation;
     let middle = u.focal * p.xy / p.z + u.center;
     let half_size = sqrt(2.0 * log(opacity / ALPHA_MIN)) * sqrt(vec2f(xx, yy));
-    if (any(middle + half_size <= vec2f(0.0)) || any(middle - half_size >= u.size)) { return; }
+    if (!(all(middle + half_size > vec2f(0.0)) && all(middle - half_size < u.size))) { return; }  // also if NaN
     let half_difference = 0.5 * (xx - yy);
     let longest = 0.5 * (xx + yy) + sqrt(half_difference * half_difference + e.uv * e.uv);
     let radius = 3.0 * sqrt(longest);
