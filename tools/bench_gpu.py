@@ -33,6 +33,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -259,7 +260,7 @@ def bench(seconds: float, cases: list[tuple[int, int, int]] | None = None) -> di
     print(f"{device.adapter.name}: {flops:.0f} GFLOP/s of multiply-adds, copies {bandwidth:.1f} GB/s")
     sizes, results = cases or CASES[: 1 if device.adapter.software else None], []
     for size in sizes:
-        result = {"splats": size[0], "width": size[1], "height": size[2]}
+        result: dict[str, Any] = {"splats": size[0], "width": size[1], "height": size[2]}
         for measure in (device_steps, copied_steps, cpu_steps):
             result |= measure(size, fastest)
         stages = result["stages_ms"]
