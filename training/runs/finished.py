@@ -18,7 +18,7 @@ from ..lod.on_disk import read_or_open_bundle
 from ..methods import create
 from ..optimize.method import ImageModel, Method
 from ..optimize.training_data import TrainingData
-from ..rasterize import tensor_device
+from ..rasterize import cpu_fallback_reason, tensor_device
 from ..splats.bundle import read_bundle, write_bundle
 from ..splats.dialects import Warn, ignore
 from ..splats.levels import Bundle
@@ -57,7 +57,7 @@ def open_evaluation(
 
     Args:
         run: run folder.
-        warn: called with warnings about the scene.
+        warn: called with warnings about the scene, and if an existing GPU is not used.
         lpips: archive of the networks' weights, see ``evaluate.lpips.load_lpips``.
 
     Returns:
@@ -67,6 +67,8 @@ def open_evaluation(
         LodgsError: see ``open_finished``.
     """
     folder, job, data = open_finished(run, warn)
+    if problem := cpu_fallback_reason(job.backend):
+        warn(problem)
     bundle = read_or_open_bundle(folder.bundle)
     networks = load_lpips(lpips, tensor_device(job.backend))
     if not networks:  # torch's threads would compete with the kernels' threads; only LPIPS gains from them

@@ -7,6 +7,7 @@ import pytest
 from training.rasterize import self_test
 from training.rasterize.gpu import default_device
 from training.runs import train as training_loop
+from training.runs.finished import open_evaluation
 from training.runs.folder import RunFolder
 from training.runs.job import Job
 from training.runs.measure import evaluate_run
@@ -120,6 +121,9 @@ def test_cpu_replaces_a_device_that_renders_incorrectly(graphics, keys, monkeypa
     warnings = [event["message"] for event in events if event["event"] == "warning"]
     (warning,) = [message for message in warnings if "is not used" in message]
     assert warning.startswith(f"{graphics.adapter.name} is not used: its images are 3% off. The CPU")
+    warnings = []
+    open_evaluation(RunFolder(keys["out"]).path, warnings.append)
+    assert warning in warnings
 
 
 @pytest.mark.slow
