@@ -174,7 +174,20 @@ class Parameters:
 
 
 @dataclass(frozen=True)
-class DensityParameters(Parameters):
+class FarViewParameters(Parameters):
+    """Parameters of methods that train some steps on reduced images."""
+
+    far_share: float = setting(
+        0.25,
+        "Fraction of late steps that reduce their image, as if seen from 2, 4, ... times the distance. "
+        "Improves small images. Late steps follow density control, except the last tenth. In Octree-GS they "
+        "follow the last level's join, and above 0 all earlier steps reduce their image too.",
+        high=1,
+    )
+
+
+@dataclass(frozen=True)
+class DensityParameters(FarViewParameters):
     """Parameters of methods with the density control of 3DGS (``optimize.density_control``)."""
 
     first_resolution: float = setting(
@@ -185,12 +198,6 @@ class DensityParameters(Parameters):
     )
     full_resolution: float = setting(
         0.5, "Fraction of the steps after which training images have full size.", high=1
-    )
-    far_share: float = setting(
-        0.25,
-        "Fraction of the steps after density control that reduce their image by 2 or 4, as if seen from "
-        "farther away, except the last tenth. Improves small images.",
-        high=1,
     )
     points_between: float = setting(
         1.0,

@@ -40,6 +40,11 @@ def test_tooltips_of_the_panel_name_only_its_parameters(method):
     assert named & about.keys() <= set(method.panel_parameters)
 
 
+def test_all_methods_declare_the_share_of_reduced_images_once():
+    declared = [f for method in METHODS.values() for f in fields(method.parameters) if f.name == "far_share"]
+    assert len(declared) == len(METHODS) and len(set(map(id, declared))) == 1
+
+
 def test_method_numbers_are_unique_and_stable():
     numbers = {name: method.number for name, method in METHODS.items()}
     assert len(set(numbers.values())) == len(numbers)

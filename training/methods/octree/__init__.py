@@ -6,7 +6,7 @@ from ...optimize.anchors.parameters import ExplicitOctreeParameters
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import AS_PUBLISHED, STANDARD
 
-_DRAFT = ExplicitOctreeParameters(lr_means=4e-4, lr_sh=5e-3, refine_steps=4_000)
+_DRAFT = ExplicitOctreeParameters(lr_means=4e-4, lr_sh=5e-3, far_share=0.05, refine_steps=4_000)
 _STANDARD = replace(_DRAFT, **STANDARD, steps=30_000, lr_sh=2.5e-3, grow_interval=100)
 _PAPER = replace(
     _STANDARD,

@@ -89,6 +89,7 @@ _DRAFT = NeuralOctreeParameters(
     steps=4300,
     max_splats=180_000,
     footprint=2.0,
+    far_share=0.05,
     full_share=0.1,
     least_weight=0.03,
     volume_weight=0.01,

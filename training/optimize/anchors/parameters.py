@@ -6,11 +6,11 @@ from ...errors import LodgsError
 from ...settings import setting
 from ...splats.levels import MAX_LEVELS
 from ..merged_parameters import MergedParameters, refining_steps
-from ..parameters import Parameters
+from ..parameters import FarViewParameters
 
 
 @dataclass(frozen=True)
-class OctreeParameters(Parameters):
+class OctreeParameters(FarViewParameters):
     """Parameters of Octree-GS, shared by explicit and neural anchors."""
 
     max_splats: int = setting(
@@ -132,15 +132,10 @@ class OctreeParameters(Parameters):
         "Increase of a splat's level bias in each growth pass where its gradient is at least a "
         "quarter of the threshold.",
     )
-    far_share: float = setting(
-        0.05,
-        "Fraction of the steps that use a downscaled photo, as if seen from 2, 4, ... times the "
-        "distance. If above 0, all steps before the finest level joins do so too.",
-        high=1,
-    )
     full_share: float = setting(
         0.4,
-        "Fraction of the remaining steps that draw all levels at every distance, like a view at full detail.",
+        "Fraction of the steps on full-size images that draw all levels at every distance, like a view at "
+        "full detail.",
         high=1,
     )
     lr_end: float = setting(
