@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..errors import LodgsError
 from .options import add_controls, add_lpips, control_values, lpips_archive, warn
 
 
@@ -26,10 +25,6 @@ def run(options: argparse.Namespace) -> int:
     from ..runs.measure import evaluate_run
     from ..runs.report_text import format_report
 
-    if options.picture and options.picture.suffix.lower() != ".png":
-        raise LodgsError(
-            f"Cannot write the picture {options.picture}: it is not a PNG.", "Use the ending .png."
-        )
     weights = lpips_archive(options)
     report = evaluate_run(options.run, control_values(options), options.picture, options.far, warn, weights)
     print(format_report(report))

@@ -19,12 +19,13 @@ from ..runs.folder import RunFolder
 from ..runs.job import Job
 from ..scenes.cameras import Camera
 from ..scenes.colmap import read_scene
+from ..scenes.images import check_suffix
 from ..scenes.view_tables import read_view_tables
 from ..splats.bundle import read_header, read_tables
 from ..splats.dialects import Warn, ignore
 from ..splats.level_folder import read_folder, read_origin
 from ..splats.levels import Bundle
-from .image import RenderedImage, check_suffix, read_depth, write_image
+from .image import SUFFIXES, RenderedImage, read_depth, write_image
 from .scene import Instance, draw
 
 
@@ -146,7 +147,7 @@ def render(
         LodgsError: the level or a control does not exist, the bundle contradicts its rule, the holdout is
             invalid, or a file cannot be read or written.
     """
-    check_suffix(out)
+    check_suffix(out, *SUFFIXES)
     limit = None if holdout is None else read_depth(holdout, camera.width, camera.height, None)
     if problem := cpu_fallback_reason(backend):
         warn(problem)

@@ -13,7 +13,10 @@ from ..color import linear_from_srgb
 from ..errors import LodgsError
 from ..files import atomic_write
 from ..scenes.exr import read_parts, write_exr
-from ..scenes.images import write_png
+from ..scenes.images import check_suffix, write_png
+
+SUFFIXES = ".png", ".exr"
+"""Endings of the images that can be written."""
 
 NO_DEPTH = 1e10
 """Depth of empty pixels, as in Blender's renderers."""
@@ -138,19 +141,13 @@ def _avoid_thresholds(values: np.ndarray) -> np.ndarray:
     return (codes + np.where(offset >= 0, above, below)) / 255
 
 
-def check_suffix(path: Path) -> None:
-    """Raise LodgsError unless a file name ends with .png or .exr."""
-    if path.suffix.lower() not in (".png", ".exr"):
-        raise LodgsError(f"Cannot write {path.name}: unsupported image format.", "Use .png or .exr.")
-
-
 def write_image(path: Path, image: RenderedImage) -> None:
     """Write a PNG, or a multilayer EXR with every pass, depending on the suffix.
 
     Raises:
         LodgsError: the suffix is not supported, or the file cannot be written.
     """
-    check_suffix(path)
+    check_suffix(path, *SUFFIXES)
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".png":
             write_png(temporary, image.eight_bit())

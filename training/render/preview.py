@@ -16,6 +16,7 @@ from ..lod.rule import Masks
 from ..lod.selection import check_rule
 from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera, pick_evenly
+from ..scenes.images import check_suffix
 from ..scenes.overview import overview_camera
 from ..scenes.view_tables import read_view_tables
 from ..splats.batches import read_batches
@@ -60,8 +61,7 @@ def preview(
     Raises:
         LodgsError: no test is enabled, or a file cannot be read or written.
     """
-    if out.suffix.lower() != ".png":
-        raise LodgsError(f"Cannot write the preview {out.name}: it is not a PNG.", "Use the ending .png.")
+    check_suffix(out, ".png")
     bundle = open_levels(source, warn)
     check_rule(bundle)
     unwanted = find_unwanted(bundle, cleaning).matches

@@ -61,6 +61,7 @@ from ..lod.selection import (
 from ..optimize.merging import merge
 from ..rasterize.resident import ResidentBundle
 from ..scenes.cameras import Camera
+from ..scenes.images import check_suffix
 from ..scenes.offset_views import read_offset_views
 from ..splats.dialects import Warn, ignore
 from ..splats.levels import Bundle
@@ -94,9 +95,11 @@ def evaluate_run(
         A report, see the module.
 
     Raises:
-        LodgsError: the run is not finished or contains a link, the rule has no such control, or a view off
-            the path cannot be read.
+        LodgsError: the run is not finished or contains a link, the rule has no such control, the image is not
+            a PNG, or a view off the path cannot be read.
     """
+    if image is not None:
+        check_suffix(image, ".png")
     folder, job, bundle, evaluation = open_evaluation(run, warn, lpips)
     rule, values = _resolve_rule(bundle, controls or {})
     report = _measure_levels(job, evaluation, bundle)

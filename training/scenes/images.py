@@ -304,6 +304,18 @@ def _sums_between(total: np.ndarray, cells: np.ndarray, fractions: np.ndarray) -
     return np.diff(total[cells] * (1 - fractions) + total[cells + 1] * fractions, axis=0)
 
 
+def check_suffix(path: Path, *suffixes: str) -> None:
+    """Check the name of an image to write.
+
+    Raises:
+        LodgsError: it ends with none of the suffixes.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise LodgsError(
+            f"Cannot write {path}: unsupported image format.", f"End its name with {' or '.join(suffixes)}."
+        )
+
+
 def write_png(path: Path, codes: np.ndarray) -> None:
     """Write a PNG from display-coded (H, W, 3) or (H, W, 4) uint8 with straight alpha.
 

@@ -174,7 +174,7 @@ def test_clutter_is_found_in_one_step(tmp_path, monkeypatch, capsys):
     [
         ("missing.ply --preview out.png --drop-floaters", "missing.ply"),
         ("in.ply --preview out.png", "Cannot preview the clean-up: no splats are tested. Add a crop"),
-        ("in.ply --preview out.jpg --drop-floaters", "Cannot write the preview out.jpg: it is not a PNG."),
+        ("in.ply --preview out.jpg --drop-floaters", "Cannot write out.jpg: unsupported image format."),
         ("in.ply --preview in.ply/out.png --drop-floaters", "Cannot write in.ply/out.png: "),
         ("in.ply", "--tiles or --preview."),
     ],
