@@ -55,6 +55,46 @@ def lodgs(bpy):
 
 
 @pytest.fixture
+def instance_of(bpy):
+    """``instance_of(collection, location)``: add an instance of a collection to the scene."""
+
+    def add(collection, location=(0, 0, 0)):
+        instance = bpy.data.objects.new("instance", None)
+        instance.instance_type, instance.instance_collection = "COLLECTION", collection
+        instance.location = location
+        bpy.context.scene.collection.objects.link(instance)
+        bpy.context.view_layer.update()
+        return instance
+
+    return add
+
+
+@pytest.fixture
+def measure_renders(bpy, lodgs, tmp_path):
+    """``measure_renders(measure)``: render frames 1 and 2 with LODGS, without the trainer.
+
+    Returns the result of ``measure(depsgraph)`` for each frame.
+    """
+
+    def render(measure):
+        scene, engine, results = bpy.context.scene, lodgs("render.engine"), {}
+        engine.use(scene)
+        scene.frame_start, scene.frame_end = 1, 2
+        scene.frame_set(2)
+        scene.render.filepath = str(tmp_path / "frame_")
+        scene.render.resolution_x = scene.render.resolution_y = 8
+
+        def render_frame(depsgraph, *_):
+            results[depsgraph.scene.frame_current] = measure(depsgraph)
+
+        with engine.use_renderer(render_frame):
+            bpy.ops.render.render(animation=True)
+        return results
+
+    return render
+
+
+@pytest.fixture
 def frame(bpy):
     """``frame(size, draw)``: call ``draw()``, return the linear image (size, size, 4), bottom row first.
 

@@ -94,17 +94,13 @@ def test_octree_weights_do_not_change_opacities(bpy, lodgs, two_levels):
     assert nearest.max() < 1e-6
 
 
-def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels):
+def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels, instance_of):
     root, _ = two_levels
     loose = lodgs("data.objects").new_splats("loose", make_splats(lodgs, 5, 7))
     points = lodgs("data.objects").new_points("points", np.zeros((3, 3)), np.zeros((3, 3), np.uint8), 1.0)
     for obj in (loose, points):
         bpy.context.scene.collection.objects.link(obj)
-    carrier = bpy.data.objects.new("carrier", None)
-    carrier.instance_type, carrier.instance_collection = "COLLECTION", root.users_collection[0]
-    carrier.location = (10, 0, 0)
-    bpy.context.scene.collection.objects.link(carrier)
-    bpy.context.view_layer.update()
+    carrier = instance_of(root.users_collection[0], (10, 0, 0))
     sets = visible_sets(bpy, lodgs)
     assert [(visible.level, len(arrays)) for visible, arrays in sets] == [(0, 7), (2, COUNT), (2, COUNT)]
     first, second = (visible.matrix_world[:3, 3] for visible, _ in sets[1:])
@@ -118,59 +114,41 @@ def test_instances_are_visible_and_hidden_objects_are_not(bpy, lodgs, two_levels
     assert visible_sets(bpy, lodgs) == []
 
 
-def test_instances_follow_the_animated_choice_of_the_camera(bpy, lodgs, two_levels, tmp_path):
+def test_instances_follow_the_animated_choice_of_the_camera(lodgs, two_levels, instance_of, measure_renders):
     """The training cameras are fixed to the splats of each instance; other cameras stay in the world."""
-    (root, _), scene = two_levels, bpy.context.scene
-    shown, engine = lodgs("data.shown"), lodgs("render.engine")
-    carrier = bpy.data.objects.new("carrier", None)
-    carrier.instance_type, carrier.instance_collection = "COLLECTION", root.users_collection[0]
-    carrier.location = (10, 0, 0)
-    scene.collection.objects.link(carrier)
+    (root, _), shown = two_levels, lodgs("data.shown")
+    instance_of(root.users_collection[0], (10, 0, 0))
     root.lodgs.mode = "SELECTIVE"
     for frame, choice in ((1, "TRAINING"), (2, "CAMERA")):
         root.lodgs.camera_choice = choice
         root.lodgs.keyframe_insert("camera_choice", frame=frame)
-    engine.use(scene)
-    scene.frame_start, scene.frame_end = 1, 2
-    scene.frame_set(2)
-    scene.render.filepath = str(tmp_path / "frame_")
-    scene.render.resolution_x = scene.render.resolution_y = 8
-    counts = {}
 
-    def render_frame(depsgraph, *_):
+    def count_positions(depsgraph):
         queries = [shown.rule_query(item, depsgraph) for item in shown.splat_instances(depsgraph)]
-        counts[depsgraph.scene.frame_current] = len({query.position for query in queries})
+        return len({query.position for query in queries})
 
-    with engine.use_renderer(render_frame):
-        bpy.ops.render.render(animation=True)
-    assert counts == {1: 1, 2: 2}
+    assert measure_renders(count_positions) == {1: 1, 2: 2}
 
 
-def test_instances_of_linked_scenes_have_level_numbers(bpy, lodgs, two_levels, tmp_path):
+def test_instances_of_linked_scenes_have_level_numbers(bpy, lodgs, two_levels, instance_of, tmp_path):
     root, _ = two_levels
     root.lodgs.mode, name = "SELECTIVE", root.users_collection[0].name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     with bpy.data.libraries.load(str(tmp_path / "scene.blend"), link=True) as (_, linked):
         linked.collections = [name]
-    carrier = bpy.data.objects.new("carrier", None)
-    carrier.instance_type, carrier.instance_collection = "COLLECTION", linked.collections[0]
-    bpy.context.scene.collection.objects.link(carrier)
+    instance_of(linked.collections[0])
     instances = lodgs("data.shown").splat_instances(bpy.context.evaluated_depsgraph_get())
     assert [instance.level for instance in instances] == [1, 2]
     assert lodgs("render.engine").level_numbers(bpy.context.scene) == [1, 2]
 
 
-def test_instances_of_the_splats_show_no_cameras(bpy, lodgs, two_levels):
+def test_instances_of_the_splats_show_no_cameras(bpy, lodgs, two_levels, instance_of):
     root, _ = two_levels
     importing = lodgs("data.importing")
     camera = lodgs("training.scenes.cameras").Camera("photo", 640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
     importing._add_views(bpy.context, root, [camera], 1.0, 0.01)
-    carrier = bpy.data.objects.new("carrier", None)
-    carrier.instance_type = "COLLECTION"
-    carrier.instance_collection = bpy.data.collections[f"{root.name} splats"]
-    bpy.context.scene.collection.objects.link(carrier)
-    bpy.context.view_layer.update()
+    carrier = instance_of(bpy.data.collections[f"{root.name} splats"])
     depsgraph = bpy.context.evaluated_depsgraph_get()
     kinds = {item.object.type for item in depsgraph.object_instances if item.is_instance}
     assert kinds == {"POINTCLOUD"}

@@ -152,12 +152,10 @@ def test_mesh_in_the_collection_of_a_splat_scene_is_rendered(bpy, lodgs, scene, 
 
 
 @pytest.mark.parametrize("name", ["collection_of", "levels_collection"])
-def test_instances_of_splats_are_no_meshes(bpy, lodgs, scene, name):
+def test_instances_of_splats_are_no_meshes(bpy, lodgs, scene, instance_of, name):
     """Cycles would draw them as points. The original scene still renders them with any engine."""
     [root] = lodgs("data.roots").roots(scene)
-    empty = bpy.data.objects.new("instance", None)
-    empty.instance_type, empty.instance_collection = "COLLECTION", getattr(lodgs("data.roots"), name)(root)
-    scene.collection.objects.link(empty)
+    instance_of(getattr(lodgs("data.roots"), name)(root))
     level = root.lodgs.levels[0].object
     bpy.ops.lodgs.combine_with_meshes()
 
@@ -191,7 +189,7 @@ def test_captures_hide_splats(bpy, lodgs, scene):
 
 
 @pytest.fixture
-def linked_instance(bpy, lodgs, scene, tmp_path):
+def linked_instance(bpy, lodgs, scene, instance_of, tmp_path):
     """An instance of a linked collection of levels, in a file without a splat scene of its own."""
     [root] = lodgs("data.roots").roots(scene)
     name = lodgs("data.roots").levels_collection(root).name
@@ -199,11 +197,7 @@ def linked_instance(bpy, lodgs, scene, tmp_path):
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, linked):
         linked.collections = [name]
-    instance = bpy.data.objects.new("instance", None)
-    instance.instance_type, instance.instance_collection = "COLLECTION", linked.collections[0]
-    bpy.context.scene.collection.objects.link(instance)
-    bpy.context.view_layer.update()
-    return instance
+    return instance_of(linked.collections[0])
 
 
 def test_captures_hide_instances_of_linked_splats(bpy, lodgs, linked_instance):

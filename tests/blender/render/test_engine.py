@@ -252,16 +252,14 @@ def test_second_scene_and_its_instance_are_rendered(bpy, lodgs, scene, bundle, t
     assert drawn[:, 500:].sum() > before[:, 500:].sum() + 1000
 
 
-def test_instances_have_the_detail_of_their_own_distance(bpy, lodgs, scene, tmp_path):
+def test_instances_have_the_detail_of_their_own_distance(bpy, lodgs, scene, instance_of, tmp_path):
     """An instance looks like the original in the same place, although the original is far away."""
     root = lodgs("data.roots").roots(scene)[0]
     root.lodgs.mode, root.lodgs.bands.gamma = "SELECTIVE", 10
     root.lodgs.freeze = False
     expected = render_file(bpy, tmp_path)
     matrix = root.matrix_world.copy()
-    instance = bpy.data.objects.new("instance", None)
-    instance.instance_type, instance.instance_collection = "COLLECTION", root.users_collection[0]
-    scene.collection.objects.link(instance)
+    instance = instance_of(root.users_collection[0])
     root.matrix_world = matrix.__class__.Translation((0, -40, 90)) @ matrix  # behind the camera, far away
     bpy.context.view_layer.update()
     instance.matrix_world = matrix @ root.matrix_world.inverted()

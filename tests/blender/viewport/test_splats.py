@@ -265,19 +265,15 @@ def test_antialiased_and_other_sets_match_the_rasterizer(bpy, lodgs, draw_view, 
     assert psnr(displayed(draw_view()), expected) > 45
 
 
-def test_copies_and_instances_are_antialiased(bpy, lodgs, draw_view):
+def test_copies_and_instances_are_antialiased(bpy, lodgs, draw_view, instance_of):
     """All copies of a scene's splats follow its antialiasing setting."""
-    from mathutils import Matrix
-
     scenes, bundle = lodgs("data.scenes"), lodgs("training.splats.bundle")
     with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
         level = scenes.set_level(root, bundle.Level(1, make_splats(lodgs, 20)))
         scenes.set_bundle_facts(root, bundle.Bundle("", []))
-    copy, instance = level.copy(), bpy.data.objects.new("instance", None)
+    copy = level.copy()
     root.users_collection[0].objects.link(copy)
-    instance.instance_type, instance.instance_collection = "COLLECTION", root.users_collection[0]
-    instance.matrix_world = Matrix.Translation((3, 0, 0))
-    bpy.context.scene.collection.objects.link(instance)
+    instance_of(root.users_collection[0], (3, 0, 0))
     standalone = bpy.data.objects.new("standalone", level.data)
     bpy.context.scene.collection.objects.link(standalone)
     shown = lodgs("data.shown")

@@ -211,28 +211,19 @@ def test_edited_scenes_are_not_streamed(bpy, lodgs, root):
     assert streams.source_of(root) is None
 
 
-def test_renders_stream_in_frames_whose_mode_is_by_distance(bpy, lodgs, root, tmp_path):
+def test_renders_stream_in_frames_whose_mode_is_by_distance(bpy, lodgs, root, measure_renders):
     """Blender evaluates keyframes for a render in copies of the objects."""
-    scene, engine = bpy.context.scene, lodgs("render.engine")
-    engine.use(scene)
+    scene, shown = bpy.context.scene, lodgs("data.shown")
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)
     for frame, mode in ((1, "SELECTIVE"), (2, "SINGLE")):
         root.lodgs.mode = mode
         root.lodgs.keyframe_insert("mode", frame=frame)
-    scene.frame_start, scene.frame_end = 1, 2
-    scene.frame_set(2)
-    scene.render.filepath = str(tmp_path / "frame_")
-    scene.render.resolution_x = scene.render.resolution_y = 8
-    is_streamed = {}
 
-    def render_frame(depsgraph, *_):
-        instances = lodgs("data.shown").splat_instances(depsgraph)
-        is_streamed[depsgraph.scene.frame_current] = any(item.source for item in instances)
+    def is_streamed(depsgraph):
+        return any(item.source for item in shown.splat_instances(depsgraph))
 
-    with engine.use_renderer(render_frame):
-        bpy.ops.render.render(animation=True)
-    assert is_streamed == {1: True, 2: False}
+    assert measure_renders(is_streamed) == {1: True, 2: False}
 
 
 def test_saved_scenes_keep_streaming(bpy, lodgs, root, path, tmp_path):
