@@ -163,7 +163,9 @@ def meta_from_comments(comments: Iterable[str]) -> dict:
         elif comment.startswith(_GEOREFERENCE):
             with suppress(ValueError, LodgsError):
                 values = parse_json(comment.removeprefix(_GEOREFERENCE), "The comment")
-                meta["georeference"] = Georeference.from_json(values).to_json()
+                place = Georeference.from_json(values)
+                if place.is_storable:
+                    meta["georeference"] = place.to_json()
     return meta
 
 

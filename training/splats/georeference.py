@@ -70,6 +70,16 @@ class Georeference:
         return {"crs": self.crs, "matrix": self.matrix.tolist()}
 
     @property
+    def is_storable(self) -> bool:
+        """True if the system fits into the header of a bundle."""
+        return self._stored_size <= _MAX_STORED
+
+    @property
+    def _stored_size(self) -> int:
+        """Bytes of the system as JSON."""
+        return len(json.dumps(self.crs))
+
+    @property
     def is_geocentric(self) -> bool:
         """True if the coordinates of the system are those of :data:`ECEF`."""
         return self.crs.upper() == ECEF
@@ -99,9 +109,10 @@ def read_georeference(folder: Path, warn: Callable[[str], object]) -> Georeferen
         text = decode_text(read_bytes(path, 2 * _MAX_TEXT))
         values = {"crs": text} if projections else parse_json(text, FILE, 2 * _MAX_TEXT)
         place = Georeference.from_json(values)
-        if (size := len(json.dumps(place.crs))) > _MAX_STORED:
+        if not place.is_storable:
             raise ValueError(
-                f"its system takes {size:,} bytes, more than {_MAX_STORED:,}. Write its EPSG code to {FILE}"
+                f"its system takes {place._stored_size:,} bytes, more than {_MAX_STORED:,}. "
+                f"Write its EPSG code to {FILE}"
             )
         return place
     except (LodgsError, OSError, ValueError) as error:

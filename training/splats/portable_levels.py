@@ -145,6 +145,8 @@ class PortableLevels:
 def parse_description(text: object, path: Path) -> tuple[Bundle, np.ndarray]:
     """Return the bundle of :meth:`PortableLevels.describe`, without splats, and its placement (4, 4).
 
+    A place on Earth that does not fit into the header of a bundle is left out.
+
     Raises:
         LodgsError: the text is invalid.
     """
@@ -153,9 +155,12 @@ def parse_description(text: object, path: Path) -> tuple[Bundle, np.ndarray]:
             raise TypeError("it is not a text")
         values = parse_json(text, f"The description in {path}")
         placement = np.array(values["placement"], np.float64).reshape(4, 4)
-        return parse_bundle(values["bundle"], values["levels"], values["meta"], path), placement
+        bundle = parse_bundle(values["bundle"], values["levels"], values["meta"], path)
     except INCONSISTENCIES as error:
         raise inconsistency_error(path, error) from error
+    if bundle.georeference is not None and not bundle.georeference.is_storable:
+        del bundle.meta["georeference"]
+    return bundle, placement
 
 
 def join_levels(groups: Sequence[Sequence[_Part]], outside: Sequence[_Part]) -> list[list[_Part]]:

@@ -145,6 +145,19 @@ def test_plain_ply_keeps_the_georeference(bundle, tmp_path):
     np.testing.assert_array_equal(on_earth(read_bundle(tmp_path / "plain.ply")), on_earth(bundle))
 
 
+def test_long_coordinate_system_leaves_files_readable(bundle, tmp_path):
+    """The header of a bundle has room for 1.5 KB."""
+    bundle.meta["georeference"]["crs"] = f'PROJCS["{"x" * 6000}"]'
+    export_levels(tmp_path / "levels.glb", bundle)
+    write_ply(tmp_path / "plain.ply", bundle.levels[0].splats, comments_from_meta(bundle.meta))
+    for name in ("levels.glb", "plain.ply"):
+        with open_as_ply(tmp_path / name) as copy:
+            levels = read_bundle(copy)
+        np.testing.assert_array_equal(levels.levels[0].splats.means, bundle.levels[0].splats.means)
+        assert levels.georeference is None
+        write_bundle(tmp_path / "bundle.ply", levels)
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".usdc"])
 def test_level_formats_keep_the_georeference(bundle, tmp_path, suffix):
     path = tmp_path / f"levels{suffix}"
