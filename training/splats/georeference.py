@@ -26,10 +26,10 @@ _MAX_STORED = 1536
 _MAX_CONDITION = 1e6
 """Maximum ratio of the largest to the smallest scale of a transform."""
 _SURFACE = 6.2e6, 6.6e6
-"""Distances in metres from the Earth's centre between which a position counts as geocentric."""
+"""Distances in metres from the Earth's centre between which a position counts as one on its surface."""
 
 
-def is_geocentric(position: np.ndarray) -> bool:
+def is_on_earth(position: np.ndarray) -> bool:
     """Return whether a position (3,) in metres is as far from the Earth's centre as its surface."""
     return _SURFACE[0] < float(np.linalg.norm(position)) < _SURFACE[1]
 
@@ -80,7 +80,7 @@ class Georeference:
         return len(json.dumps(self.crs))
 
     @property
-    def is_geocentric(self) -> bool:
+    def is_ecef(self) -> bool:
         """True if the coordinates of the system are those of :data:`ECEF`."""
         return self.crs.upper() == ECEF
 

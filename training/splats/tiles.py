@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import LodgsError
 from ..files import atomic_folder, check_export_folder
 from .gaussians import SplatRows, Splats
-from .georeference import is_geocentric
+from .georeference import is_on_earth
 from .gltf import COMPRESSION, SPLATS, write_compressed_glb
 from .levels import Bundle, Level
 from .portable_levels import PortableLevels, portable_batches
@@ -73,7 +73,7 @@ def _earth_transform(
     (N, 3) to those that this transform moves to the right place.
     """
     place = bundle.georeference
-    if place is not None and place.is_geocentric:
+    if place is not None and place.is_ecef:
         return place.matrix, None
     if place is not None and (zone := place.zone) is not None:
         matrix = place.matrix
@@ -105,7 +105,7 @@ def _earth_transform(
             return bent
 
         return transform, bend
-    if not is_geocentric(bundle.origin):
+    if not is_on_earth(bundle.origin):
         return None, None
     transform = np.eye(4)
     transform[:3, 3] = bundle.origin

@@ -16,7 +16,7 @@ import numpy as np
 from ...documents import DECIMAL_COMMAS, has_decimal_commas, open_text
 from ...errors import LodgsError
 from ...files import is_file
-from ...splats.georeference import ECEF, Georeference, is_geocentric
+from ...splats.georeference import ECEF, Georeference, is_on_earth
 from ..lenses import Intrinsics
 from .exported import (
     ExportedScene,
@@ -117,7 +117,7 @@ class _Chunk:
         self._base, self._scale = base, np.cbrt(np.linalg.det(base[:3, :3]))
         system = (chunk.findtext("reference") or "").strip()
         self.georeference = None
-        if system and not system.startswith(_LOCAL) and is_geocentric(base[:3, 3]):
+        if system and not system.startswith(_LOCAL) and is_on_earth(base[:3, 3]):
             self.georeference = Georeference(ECEF, base @ np.diag([1 / self._scale] * 3 + [1.0]))
 
     def view(self, camera: Element) -> ExportedView:
