@@ -156,6 +156,7 @@ def _train(job: Job, folder: RunFolder, events: EventWriter, placement: dict[str
         report_backend(job, data.scene, backend, events)
         if merged_is_result:
             _write_merged_levels(folder, events, data, backend, started)
+            remove_checkpoints(folder)
             return DONE
         run = _TrainingRun(job, backend, folder, events, data)
     with stop_signals() as received:

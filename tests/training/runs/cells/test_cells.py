@@ -595,6 +595,7 @@ def test_bundle_of_cells_is_like_that_of_an_undivided_run(tiny_scene, tmp_path, 
     assert {key: value for key, value in bundle.meta.items() if key in expected.meta} == expected.meta
     assert [event["splats"] for event in folder.levels()] == [len(level.splats) for level in bundle.levels]
     assert folder.state() == "done" and "train_psnr" in folder.last_event("done")
+    assert not folder.checkpoints.exists()
 
 
 @pytest.mark.slow
