@@ -61,7 +61,7 @@ def join_levels(levels: Mapping[int, Mapping[str, torch.Tensor]], lr: Mapping[st
 @torch.no_grad()
 def restart_levels(
     levels: Mapping[int, Mapping[str, torch.Tensor]],
-    numbers: Sequence[int],
+    limits: Mapping[int, int],
     s_min: Sequence[float],
     data: TrainingData,
     parameters: Parameters,
@@ -76,7 +76,7 @@ def restart_levels(
 
     Args:
         levels: see :func:`join_levels`.
-        numbers: levels to restart, coarse to fine, the last one before the finest.
+        limits: maximum splat count of each level to restart, coarse to fine, the last one before the finest.
         drawn: number of splats that views by distance may draw, as a fraction of those of the finest level.
         gamma: screen size for the selection of levels.
 
@@ -85,7 +85,7 @@ def restart_levels(
             Mip-Splatting's filter, which fades splats below a pixel, enlarged splats become fainter in
             proportion to their area.
     """
-    p, (coarsest, *_, finest) = parameters, levels
+    p, (coarsest, *_, finest), numbers = parameters, levels, list(limits)
     order = torch.from_numpy(spatial_order(levels[finest]["means"].cpu().numpy()))
     tensors = {name: tensor[order.to(tensor.device)] for name, tensor in levels[finest].items()}
     wide = (camera.widened(p.margin) for camera in data.train)
@@ -107,11 +107,10 @@ def restart_levels(
     other_splats = sum(int(counts.sum()) for number, counts in views.items() if number not in numbers)
     max_views = max(drawn * finest_views.sum() - other_splats, MIN_SHARE * own_views.sum())
     threshold = importance_threshold(np.concatenate(list(scores.values())), own_views, max_views)
+    masks = {number: (scores[number] >= threshold) & (rank <= limits[number]) for number in numbers}
     return {
-        number: _select_enlarged(
-            tensors, scores[number] >= threshold, importance, s_min[number - 1], p.antialias
-        )
-        for number in numbers
+        number: _select_enlarged(tensors, mask, importance, s_min[number - 1], p.antialias)
+        for number, mask in masks.items()
     }
 
 

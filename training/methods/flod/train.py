@@ -73,7 +73,11 @@ class Method(method.Method[FlodParameters, Drawing]):
         if p.levels > 1:
             self.controls = {"gamma": initial_gamma(self.s_min[-2] * data.focal / data.median_depth)}
         if base is None:
-            self.model = self._new_model(self._from_points(self.stages.level_at(0)))
+            first = self.stages.level_at(0)
+            limit = p.growth_limit(self.budget(first))
+            self.model = self._new_model(
+                self._from_points(first, *sample_points(self.points, self.colors, limit, self.seed))
+            )
         else:
             self._store(p.first_level - 1, base)
             tensors = from_splats(base, p.sh_degree, self.device)
@@ -246,9 +250,9 @@ class Method(method.Method[FlodParameters, Drawing]):
     # -- levels ----------------------------------------------------------------------------------------
 
     def budget(self, level: int) -> int:
-        """Return the maximum splat count of a level."""
+        """Return the maximum splat count of a level, at least 1."""
         p = self.parameters
-        return int(p.splat_limit * p.budget_ratio ** (p.levels - level))
+        return max(int(p.splat_limit * p.budget_ratio ** (p.levels - level)), 1)
 
     def _constraint(self, level: int) -> float:
         """Return the minimum standard deviation that training imposes on a level: none on merged ones."""
@@ -289,7 +293,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             if len(free) > room:
                 rng = np.random.default_rng([self.seed, level, 2])
                 free = np.sort(rng.choice(free, room, replace=False))
-            points = self._from_points(level)
+            points = self._from_points(level, self.points, self.colors)
             tensors = {name: torch.cat([tensor, points[name][free]]) for name, tensor in tensors.items()}
         return tensors
 
@@ -316,12 +320,13 @@ class Method(method.Method[FlodParameters, Drawing]):
         fine = [number for number in levels if 0 < self.s_min[number - 1] <= max_size]
         if fine and not p.merges:
             gamma = self.controls["gamma"]
-            levels |= finish.restart_levels(levels, fine, self.s_min, data, p, p.drawn, gamma, self.backend)
+            limits = {number: self.budget(number) for number in fine}
+            levels |= finish.restart_levels(levels, limits, self.s_min, data, p, p.drawn, gamma, self.backend)
         self.model = finish.join_levels(levels, refining_rates(p, data.extent, 0.0))
 
-    def _from_points(self, level: int) -> dict[str, torch.Tensor]:
+    def _from_points(self, level: int, points: np.ndarray, colors: np.ndarray) -> dict[str, torch.Tensor]:
         s_min = self.s_min[level - 1]
-        return from_points(self.points, self.colors, self.parameters.sh_degree, self.device, s_min)
+        return from_points(points, colors, self.parameters.sh_degree, self.device, s_min)
 
     def _new_model(self, tensors: dict[str, torch.Tensor]) -> Model:
         return Model(tensors, splat_rates(self.parameters, self.data.extent))
