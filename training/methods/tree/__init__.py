@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+from ...errors import LodgsError
 from ...optimize.method_info import MethodInfo
 from ...optimize.parameters import PAPER, STANDARD, SplatParameters
 from ...settings import setting
@@ -104,6 +105,14 @@ class TreeParameters(SplatParameters):
     @property
     def growth_rounds(self) -> float | None:
         return None  # leaves grow, too
+
+    def check(self) -> None:
+        super().check()
+        if self.max_trained_splats == 1:
+            raise LodgsError(
+                "Cannot build a tree: 'max_splats' is 1, but it needs at least two splats.",
+                "Give a larger number.",
+            )
 
 
 _DRAFT = TreeParameters()

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.training.lod.tree.trees import surfaces
+from training.errors import LodgsError
 from training.lod.selection import BundleSelector, resolve_controls
 from training.lod.tree.forest import merge_forest
 from training.lod.tree.nodes import min_parent_size
@@ -24,6 +25,13 @@ from training.splats.levels import Bundle
 def make(data, base=None, preset="draft", **values):
     short = {"steps": 12, "densify_until": 0.4, "prune_interval": 6, "tune_steps": 8, "margin": 0.0}
     return create("tree", data, override(method_info("tree").preset(preset), short | values), 0, "cpu", base)
+
+
+def test_limit_of_one_splat_is_refused_before_training():
+    draft = method_info("tree").preset("draft")
+    with pytest.raises(LodgsError, match="'max_splats' is 1, but it needs at least two splats"):
+        override(draft, {"max_splats": 1})
+    assert override(draft, {"max_splats": 1, "sky_points": 1}).max_trained_splats == 2
 
 
 def trained(tree, begin=0, until=None):
