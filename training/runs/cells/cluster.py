@@ -28,10 +28,10 @@ PORT = 8786
 CONFIGURATION = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
-    "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "warning",
+    "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
 }
-"""Dask configuration without web pages, and without routine messages of the processes of workers. Dask opens
-its HTTP servers even without pages."""
+"""Dask configuration without web pages, and without messages of the processes of workers: their errors reach
+the client, and a lost scheduler the nanny. Dask opens its HTTP servers even without pages."""
 _HTTP_ADDRESS = "127.0.0.1:0"
 _SCHEDULER_CLOSES = "scheduler-close"
 """Dask's reason to close a worker when its scheduler is stopped."""

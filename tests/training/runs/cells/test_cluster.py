@@ -171,7 +171,8 @@ def test_stopped_scheduler_prints_no_stacks_of_its_connections(tmp_path, number)
     finally:
         scheduler.kill()
     assert "Traceback" not in scheduler.stdout.read()
-    assert " INFO " not in worker.stdout.read()
+    output = worker.stdout.read()
+    assert "Traceback" not in output and " INFO " not in output
 
 
 @pytest.mark.slow
