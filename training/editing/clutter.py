@@ -6,6 +6,7 @@ The ``lodgs edit`` command and the Clean Up panel share these declarations. nump
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +51,8 @@ class SceneSubject:
     """The subject of a scene.
 
     Attributes:
-        center, radius: ball around it, see ``overview.central_ball``.
+        center, radius: ball around it, see ``overview.central_ball``. The radius is infinite if most splats
+            are at one place, so that none of them is clutter.
         ground: unit normal (3,) and a point (3,) of the ground below it; None without a ground.
     """
 
@@ -102,7 +104,7 @@ def find_subject(means: np.ndarray, up: np.ndarray, ground_points: np.ndarray) -
         ground_points: (P, 3) points for the detection of the ground.
     """
     means = means[np.isfinite(means).all(axis=1)]
-    center, radius = central_ball(means) if len(means) else (np.zeros(3), 1.0)
+    center, radius = central_ball(means, inf) if len(means) else (np.zeros(3), inf)
     ground = ground_plane(ground_points, up)
     return SceneSubject(center, radius, None if ground is None else ground[:2])
 

@@ -62,20 +62,21 @@ _TANGENT = 0.7
 """Half width of the view at depth 1: the default lens of Blender's viewports."""
 
 
-def central_ball(means: np.ndarray) -> tuple[np.ndarray, float]:
+def central_ball(means: np.ndarray, default: float = 1.0) -> tuple[np.ndarray, float]:
     """Return center (3,) and radius of a ball around the subject of a scene.
 
     It holds nine tenths of the splats, or those within 2.5 times the median distance from the median position
-    if that is smaller, as in scenes with a far background. The radius is 1 if most splats are at one place.
+    if that is smaller, as in scenes with a far background.
 
     Args:
         means: (N, 3) finite positions, N > 0.
+        default: radius if most splats are at one place.
     """
     means = means.astype(np.float64)
     distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     median, ninth_decile = np.percentile(distances, (50, 90))
     near = means[is_near(means)]
-    return np.median(near, axis=0), float(min(ninth_decile, _FAR_FACTOR * median)) or 1.0
+    return np.median(near, axis=0), float(min(ninth_decile, _FAR_FACTOR * median)) or default
 
 
 def is_near(means: np.ndarray) -> np.ndarray:

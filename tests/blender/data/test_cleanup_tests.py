@@ -49,6 +49,16 @@ def clutter_counts(bpy, lodgs, root):
     }
 
 
+def test_one_large_splat_is_no_clutter(bpy, lodgs, tmp_path):
+    columns = np.ones((1, 3)), np.eye(1, 4), np.full((1, 3), 7.0), np.ones(1), np.zeros((1, 1, 3))
+    splats = Splats(*(np.float32(column) for column in columns))
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, splats)]))
+    lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
+    assert bpy.ops.lodgs.find_clutter() == {"FINISHED"}
+    [root] = lodgs("data.roots").roots(bpy.context.scene)
+    assert set(lodgs("data.clutter").count_by_kind(root).values()) == {0}
+
+
 def test_all_kinds_of_clutter_are_counted_coloured_and_hidden(bpy, lodgs, root):
     isolated = FLOATERS + BELOW  # distant ones are not near the subject
     counts = {"LARGE": OVERSIZED, "DISTANT": DISTANT, "FLOATERS": isolated, "BELOW": BELOW, "HALOS": HALOS}

@@ -154,9 +154,10 @@ def test_floaters_are_small_clusters_of_touching_cells(seed):
 
 
 @pytest.mark.parametrize("count", [1, 5])
-def test_splats_at_one_place_are_no_clutter(count):
+@pytest.mark.parametrize(("size", "opacity"), [(-2.0, 1.0), (7.0, 1.0), (7.0, -4.0)])
+def test_splats_at_one_place_are_no_clutter(count, size, opacity):
     splats = some_splats(np.random.default_rng(0), count)
-    splats.means[:], splats.log_scales[:], splats.opacity_logits[:] = 3.0, -2.0, 1.0
+    splats.means[:], splats.log_scales[:], splats.opacity_logits[:] = 3.0, size, opacity
     bundle = clean_bundle(Bundle("", [Level(1, splats)]), Cleaning(clutter=True))
     assert len(bundle.levels[0].splats) == count
 
