@@ -201,6 +201,7 @@ def _image_names(views: Sequence[str]) -> list[str]:
     names: dict[str, str] = {}
     for number, view in enumerate(views):
         name = re.sub(r'[\x00-\x1f\\/:*?"<>|\ud800-\udfff]', "_", view).lstrip(". ")[-_MAX_NAME:]
-        name = f"{number}_{name}" if not name or name.casefold() in names else name
+        while not name or name.casefold() in names:
+            name = f"{number}_{name}"
         names[name.casefold()] = f"{name}.jpg"
     return list(names.values())

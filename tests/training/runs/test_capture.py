@@ -119,7 +119,8 @@ def test_own_cameras_of_a_bundle_are_used(ball, tmp_path, count):
 
 def test_views_of_a_bundle_are_captured_into_one_folder(ball, tmp_path):
     """Bundles name views like photos, in subfolders; a foreign bundle's names may leave the folder."""
-    names = ["left/a.jpg", "right/a.jpg", "right\\A.jpg", "../../out", str(tmp_path / "absolute"), ""]
+    names = ["left/a.jpg", "right/a.jpg", "3_right_A.jpg", "right\\A.jpg", "../../out", ""]
+    names.append(str(tmp_path / "absolute"))
     views, near = dome_views(ball, len(names), 48, 32)
     views = [replace(view, name=name) for view, name in zip(views, names, strict=True)]
     write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, ball)], tables=make_view_tables(views, near)))
