@@ -391,7 +391,8 @@ def _absolute_path(key: str, value: str, folder: Path) -> str:
     try:
         home = Path(value).expanduser() if value.startswith("~") else value
         path = str((folder / home).resolve())
-    except (OSError, ValueError, RuntimeError) as error:  # NUL, unknown ~name, link cycle
+        path.encode()
+    except (OSError, ValueError, RuntimeError) as error:  # NUL, unknown ~name, link cycle, not UTF-8
         raise LodgsError(f"Invalid path {key} = {quote(value)}: {error}.", "Correct the path.") from error
     if len(path) > MAX_PATH:
         raise LodgsError(
@@ -401,5 +402,6 @@ def _absolute_path(key: str, value: str, folder: Path) -> str:
 
 
 def _toml_line(name: str, value) -> str:
-    # JSON's strings, numbers, booleans and lists are TOML's as well.
-    return f"{name} = {json.dumps(value, ensure_ascii=False)}"
+    # JSON's strings, numbers, booleans and lists are TOML's as well, except for one character.
+    text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return f"{name} = {text}"

@@ -35,7 +35,7 @@ def test_home_folder_is_the_same_from_every_folder(tmp_path, monkeypatch):
 def test_job_with_unusual_paths_round_trips(tmp_path):
     job = Job(
         scene='/a "quoted" \\ folder/ü 日本',
-        out="/b\tc",
+        out="/b\tc\x7f",
         parameters={"steps": [1, 2, 3], "levels": 3, "rho": 3.5},
     )
     job.write(tmp_path / "job.toml")
@@ -164,6 +164,11 @@ def test_invalid_parameters_are_rejected_before_training(tmp_path, method, value
     text = f'scene = "a"\nout = "b"\nmethod = "{method}"\n[parameters]\n{values}\n'
     with pytest.raises(LodgsError, match=message):
         Job.from_file(write(tmp_path / "job.toml", text))
+
+
+def test_path_that_is_not_utf_8_is_rejected():
+    with pytest.raises(LodgsError, match=r"Invalid path out = '/b\\udcff': 'utf-8' codec can't encode"):
+        Job.from_dict({"scene": "/a", "out": "/b\udcff"})
 
 
 def test_missing_job_file_is_reported(tmp_path):
