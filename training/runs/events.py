@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -234,18 +234,19 @@ def event_line(kind: str, **values) -> str:
     Numbers that are not finite become null; characters that UTF-8 cannot encode become question marks.
     """
     event = {"event": kind, "time": round(time.time(), 3), **values}
-    line = json.dumps(_finite(event), ensure_ascii=False, allow_nan=False)
+    line = json.dumps(finite(event), ensure_ascii=False, allow_nan=False)
     return line.encode("utf-8", "replace").decode()
 
 
-def _finite(value):
+def finite(value: Any) -> Any:
+    """Replace numbers in JSON values that are not finite by None."""
     match value:
         case float():
             return value if math.isfinite(value) else None
         case dict():
-            return {name: _finite(item) for name, item in value.items()}
+            return {name: finite(item) for name, item in value.items()}
         case list() | tuple():
-            return [_finite(item) for item in value]
+            return [finite(item) for item in value]
     return value
 
 

@@ -31,7 +31,6 @@ training views as ``train_psnr`` and ``train_ssim``.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -65,6 +64,7 @@ from ..scenes.images import check_suffix
 from ..scenes.offset_views import read_offset_views
 from ..splats.dialects import Warn, ignore
 from ..splats.levels import Bundle
+from .events import finite
 from .finished import load_networks, open_evaluation
 from .folder import RunFolder
 from .job import Job
@@ -270,16 +270,3 @@ def _measure_networks(job: Job, folder: RunFolder, evaluation: Evaluation) -> di
     """Return the quality of the run's neural model before baking, and the splats that it decodes."""
     _, model = load_networks(job, folder, evaluation.data)
     return evaluation.measure(model.render)
-
-
-def finite(value):
-    """Replace numbers that are not finite by None, for JSON."""
-    match value:
-        case dict():
-            return {key: finite(item) for key, item in value.items()}
-        case list() | tuple():
-            return [finite(item) for item in value]
-        case float() if not math.isfinite(value):
-            return None
-        case _:
-            return value

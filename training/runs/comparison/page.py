@@ -15,9 +15,9 @@ from ...lod.rule import Values
 from ...lod.selection import complete_splats, resolve_controls
 from ...scenes.cameras import Camera
 from ...splats.dialects import Warn, ignore
+from ..events import finite
 from ..finished import open_finished
 from ..folder import RunFolder
-from ..measure import finite
 from .images import RunImages, compared_views, photos, render_merges, render_run
 from .measures import (
     ComparedRun,
