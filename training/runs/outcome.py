@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .events import read_events
+from .failures import BAD_INPUT, CANCELLED, DONE
 from .folder import RunFolder
 
 
@@ -22,20 +23,20 @@ def run_outcome(folder: RunFolder, code: int | None) -> tuple[str, str]:
     if not folder.path.is_dir():
         return "interrupted", f"The run folder {folder.path} does not exist: it was moved or deleted."
     state = folder.state()
-    if code == 2 and state in {"running", "done", "cancelled"}:
+    if code == BAD_INPUT and state in {"running", "done", "cancelled"}:
         code = None  # another process trained this run; ours could not lock it
     error = folder.end_event() if state == "failed" else None
-    if error is None and code == 2:  # it could not open its run
+    if error is None and code == BAD_INPUT:  # it could not open its run
         printed = read_events(folder.output)[0]
         error = next((event for event in reversed(printed) if event["event"] == "error"), None)
     if error is not None:
         return "failed", f"{error['what']} {error.get('remedy', '')}".strip()
-    if code == 2:
+    if code == BAD_INPUT:
         return "failed", (
             f"The trainer could not write to {folder.path}: the disk is full or read-only. "
             "Free some space and resume the run."
         )
-    if state in {"interrupted", "empty"} or code not in {None, 0, 3}:
+    if state in {"interrupted", "empty"} or code not in {None, DONE, CANCELLED}:
         return "interrupted", _exit_reason(code, folder.log_tail(1))
     return state, ""
 
