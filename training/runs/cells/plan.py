@@ -29,11 +29,12 @@ from ...scenes.colmap import Scene, read_scene
 from ...scenes.regions import Region, plan_cells
 from ...scenes.triangulate import cached_points
 from ..base import base_origin
+from ..events import PART_KINDS
 from ..folder import RunFolder
 from ..job import MAX_CELLS, Job
 
 REGION = "region.json"
-COARSE, CELL, SEAM = "coarse", "block", "seam"
+COARSE, CELL, SEAM = PART_KINDS
 """Kinds of parts: coarse levels of the full scene, a cell, and a cell whose borders are fitted. Files, events
 and commands call a cell a block."""
 SEAM_METHOD = "3dgs"
