@@ -115,10 +115,10 @@ def evaluate_run(
         jumps = measure_popping(evaluation, bundle, values, middle)
         report["jumps"] = {name: max(row) for name, row in jumps.items()}
         report["flight"] = next(iter(jumps.values()))
-    if image is not None:
-        write_level_sheet(image, bundle, evaluation, middle, values)
     with atomic_write(folder.metrics) as temporary:
         Path(temporary).write_text(json.dumps(finite(report), indent=1, allow_nan=False), encoding="utf-8")
+    if image is not None:
+        write_level_sheet(image, bundle, evaluation, middle, values)
     return report
 
 

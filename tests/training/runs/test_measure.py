@@ -284,6 +284,13 @@ def test_read_only_run_folder_is_named(finished, monkeypatch, capsys):
     assert capsys.readouterr().err.endswith(expected)
 
 
+def test_metrics_remain_if_the_picture_cannot_be_written(finished, tmp_path):
+    run = finished(test_every=4)
+    with pytest.raises(LodgsError, match=r"Cannot write .*levels\.png"):
+        evaluate_run(run, image=run / "job.toml" / "levels.png")
+    assert RunFolder(run).read_metrics()["levels"]
+
+
 def test_unfinished_run_is_rejected(tmp_path):
     with pytest.raises(LodgsError, match=r"not a finished run"):
         evaluate_run(tmp_path)
