@@ -218,8 +218,11 @@ class Job:
 
     def _check(self) -> None:
         """Check keys against each other, and the parameters."""
-        if self.test_every == 1:
-            raise LodgsError("test_every = 1 leaves no view to train on.", "Use 0 or at least 2.")
+        minimum = 3 if self.validation else 2
+        if 0 < self.test_every < minimum:
+            raise LodgsError(
+                f"test_every = {self.test_every} leaves no view to train on.", f"Use 0 or at least {minimum}."
+            )
         continues = self.resolved_parameters().continues_levels
         if continues and not self.base:
             raise LodgsError(
@@ -270,12 +273,17 @@ class Job:
 
     def warnings(self) -> list[str]:
         """Return warnings about settings that contradict each other but are valid."""
-        if self.preset != "paper" or self.image_scale == 1:
-            return []
-        return [
-            f"The preset paper trains at the photos' size, but image_scale is {self.image_scale:g}. "
-            "Set it to 1 to reproduce the paper."
-        ]
+        warnings = []
+        if self.preset == "paper" and self.image_scale != 1:
+            warnings.append(
+                f"The preset paper trains at the photos' size, but image_scale is {self.image_scale:g}. "
+                "Set it to 1 to reproduce the paper."
+            )
+        if self.validation and not self.test_every:
+            warnings.append(
+                "No views are held out, because test_every is 0. Set it to 3 or more, or remove validation."
+            )
+        return warnings
 
     def with_cells(self, cells: str) -> Job:
         """Return the same job with another number of cells.

@@ -203,6 +203,14 @@ def test_settings_may_change_after_a_failed_start_only(tmp_path):
         save_job(first, run)
 
 
+def test_validation_needs_views_to_hold_out_and_to_train_on():
+    values = {"scene": "photos", "out": "run", "validation": True}
+    assert "test_every is 0. Set it to 3" in Job.from_dict({**values, "test_every": 0}).warnings()[0]
+    assert Job.from_dict({**values, "test_every": 3}).warnings() == []
+    with pytest.raises(LodgsError, match=r"test_every = 2 leaves no view to train on. Use 0 or at least 3"):
+        Job.from_dict({**values, "test_every": 2})
+
+
 def test_preset_paper_trains_at_full_size():
     """A smaller scale, also from before, is kept with a warning."""
     values = {"scene": "photos", "out": "run"}

@@ -624,7 +624,7 @@ def test_unexpected_error_is_an_event_with_details_in_the_log(uninterrupted, tmp
     ("views", "keys", "message"),
     [
         (2, {}, "1 of 2 usable views in .* remain"),
-        (4, {"test_every": 2, "validation": True}, "0 of 4 usable views in .* remain"),
+        (4, {"test_every": 3, "validation": True}, "1 of 4 usable views in .* remain"),
         (4, {"validation": True}, "for validation"),
         (4, {"test_every": 0, "image_scale": 0.15}, "9 x 7 pixels, 11 per side"),
     ],
