@@ -24,7 +24,11 @@ FRAMES = 120
 
 
 def pull_back(camera: Camera, factor: float, depth: float) -> Camera:
-    """Move a camera back until a point at ``depth`` in front of it is ``factor`` times as far away."""
+    """Move a camera back until a point at ``depth`` in front of it is ``factor`` times as far away.
+
+    Args:
+        depth: depth in scene units.
+    """
     pose = camera.world_to_camera.copy()
     pose[2, 3] += (factor - 1) * depth
     return replace(camera, world_to_camera=pose)
@@ -76,7 +80,7 @@ def fly_out(camera: Camera, depth: float, step: int = 1) -> list[Camera]:
     """Return the views of a camera move back to FACTORS[-1] times the distance, in FRAMES equal factors.
 
     Args:
-        depth: distance in front of the camera that the factors multiply.
+        depth: distance in front of the camera, in scene units, that the factors multiply.
         step: number of frames from one returned view to the next.
     """
     factors = np.geomspace(FACTORS[0], FACTORS[-1], FRAMES)[::step]
@@ -122,5 +126,5 @@ def measure_popping(
 
 
 def _differences(images: Iterable[np.ndarray]) -> np.ndarray:
-    """Return the mean absolute difference between consecutive images."""
+    """Return the mean absolute differences (F - 1,) between F consecutive images (H, W, 3)."""
     return np.array([np.abs(second - first).mean() for first, second in pairwise(images)])

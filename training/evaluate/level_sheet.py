@@ -76,6 +76,12 @@ def in_level_colors(bundle: Bundle) -> Bundle:
 def _write_tiles(
     path: Path, tiles: list[tuple[str, torch.Tensor]], columns: int = 4, caption: int = 22
 ) -> None:
+    """Write images (H, W, 3) in [0, 1] of equal size with their captions as a PNG.
+
+    Args:
+        columns: maximum number of images in a row.
+        caption: height of a caption in pixels.
+    """
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(size=13)

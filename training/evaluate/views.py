@@ -129,7 +129,7 @@ class Evaluation:
         return Evaluation(self.data, self.backend, antialias, self.measures)
 
     def target(self, camera: Camera) -> Target:
-        """Return the photo of a view, with transparent parts black, and its mask."""
+        """Return the photo (H, W, 3) of a view, with transparent parts black, and its mask (H, W) or None."""
         return self.data.images.target(camera)
 
     def load(self, splats: Splats | Gaussians) -> Gaussians:
@@ -145,7 +145,7 @@ class Evaluation:
     def render(
         self, splats: Splats | Gaussians, camera: Camera, weights: np.ndarray | None = None
     ) -> Rendering:
-        """Draw splats as :meth:`draw` does and return the complete rendering."""
+        """Draw splats as :meth:`draw` does and return the complete rendering, on the rasterizer's device."""
         with torch.no_grad():
             return rasterize(
                 self.load(splats),
@@ -213,7 +213,7 @@ class Evaluation:
         return {"splats": round(float(splats)), "drawn": round(float(np.mean(drawn))), **quality}
 
     def measure_images(self, draw_image: Callable[[Camera], torch.Tensor]) -> dict:
-        """Measure quality and ``frame_s`` as :meth:`measure` does, for images from any source."""
+        """Measure quality and ``frame_s`` as :meth:`measure` does, for images (H, W, 3) from any source."""
         rows = []
         for camera in self.cameras:
             started = time.perf_counter()
@@ -259,7 +259,7 @@ class Evaluation:
         return dict(self._measured[digest])
 
     def measure_splats(self, splats: Splats, weights: np.ndarray | None = None) -> dict:
-        """Measure one set of splats that is the same for all views."""
+        """Measure one set of splats that is the same for all views, with weights (N,) on their opacities."""
         sets = [WeightedSet(SplatSet(splats, weights, self.backend), None)]
         return self.measure(
             lambda camera: draw(sets, camera, backend=self.backend, **self._options),
