@@ -141,20 +141,20 @@ def estimate(job: Job, scratch: Path) -> Estimate:
 def suggest_settings(job: Job, costs: Estimate) -> list[Finding]:
     """Return settings to change, with their reason."""
     findings = []
-    longer = max(costs.size)
+    side = max(costs.size)
     if costs.memory > MAX_USE * costs.free_memory:
         problem = f"Training needs more than {MAX_USE:.0%} of the free memory."
         findings.append(Finding(ESTIMATE, problem, _memory_remedy(job, costs)))
     if costs.disk > MAX_USE * costs.free_disk:
         problem = f"The run may need more than {MAX_USE:.0%} of the free disk space."
         findings.append(Finding(ESTIMATE, problem, "Choose a run folder on another disk."))
-    if longer > LARGE_SIDE:
-        scale = job.image_scale * LARGE_SIDE / longer
-        problem = f"The longer side of training images has {longer} pixels; papers use at most {LARGE_SIDE}."
+    if side > LARGE_SIDE:
+        scale = job.image_scale * LARGE_SIDE / side
+        problem = f"The longer side of training images has {side} pixels; papers use at most {LARGE_SIDE}."
         findings.append(Finding(ESTIMATE, problem, f"Set the image scale to {scale:.2g} to train faster."))
-    elif longer < SMALL_SIDE and job.image_scale < 1:
-        scale = min(job.image_scale * SMALL_SIDE / longer, 1.0)
-        problem = f"The longer side of training images has only {longer} pixels, which loses details."
+    elif side < SMALL_SIDE and job.image_scale < 1:
+        scale = min(job.image_scale * SMALL_SIDE / side, 1.0)
+        problem = f"The longer side of training images has only {side} pixels, which loses details."
         findings.append(Finding(ESTIMATE, problem, f"Set the image scale to {scale:.2g}."))
     if costs.seconds > LONG_SECONDS and job.preset != "draft":
         problem = f"Training takes more than {LONG_SECONDS // 3600} hours on this computer."

@@ -73,8 +73,8 @@ class ReducedJobs:
         if effort < 1:
             sizes = np.array([(camera.width, camera.height) for camera in read_scene(scene).cameras])
             if "image_scale" not in keys:
-                least = min(SMALL_SIDE / sizes.max(), scale)
-                scale = round(max(scale * effort**0.5, least), 4)
+                min_scale = min(SMALL_SIDE / sizes.max(), scale)
+                scale = round(max(scale * effort**0.5, min_scale), 4)
             self._pixel_ratio = scale / default_image_scale(preset)
             self._max_splats = round(MAX_DENSITY * float(np.median(sizes.prod(axis=1))) * scale**2)
         self._keys["image_scale"] = scale
@@ -113,16 +113,17 @@ def train_in_turn(jobs: Sequence[NamedJob], train: Train, notify: Callable[[str]
     Args:
         notify: receives sentences about progress.
     """
-    remaining = [job for _, job in jobs if RunFolder(job.out).state() != "done"]
-    expected = _estimate(remaining, notify)
-    spent = estimated = 0.0
+    unfinished = [job for _, job in jobs if RunFolder(job.out).state() != "done"]
+    expected_seconds = _estimate(unfinished, notify)
+    elapsed = estimated = 0.0  # seconds of the finished trainings
     for number, (name, job) in enumerate(jobs, 1):
-        left = sum(expected) * (spent / estimated if estimated else 1.0)
-        end = f", about {format_duration(left)} left" if left else ""
+        remaining = sum(expected_seconds) * (elapsed / estimated if estimated else 1.0)
+        end = f", about {format_duration(remaining)} left" if remaining else ""
         begin = time.monotonic()
         yield train(job, f"Training {name} ({number} of {len(jobs)}{end})")
-        if expected and job in remaining:
-            spent, estimated = spent + time.monotonic() - begin, estimated + expected.pop(0)
+        if expected_seconds and job in unfinished:
+            elapsed += time.monotonic() - begin
+            estimated += expected_seconds.pop(0)
 
 
 def _estimate(jobs: Sequence[Job], notify: Callable[[str], object]) -> list[float]:
