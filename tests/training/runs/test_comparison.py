@@ -232,6 +232,19 @@ def test_runs_with_other_held_out_views_are_refused(first, second, runs, monkeyp
         label_runs([Path("a"), Path("b")])
 
 
+def test_runs_with_photos_of_another_size_are_compared_with_a_warning(runs, monkeypatch):
+    job = Job.from_file(RunFolder(runs[0]).job)
+    jobs = {"a": job, "b": replace(job, image_scale=0.5)}
+    monkeypatch.setattr(
+        "training.runs.comparison.measures.open_finished", lambda run, warn: (None, jobs[run.name], None)
+    )
+    warnings = []
+    label_runs([Path("a")], warnings.append)
+    assert warnings == []
+    label_runs([Path("a"), Path("b")], warnings.append)
+    assert len(warnings) == 1 and "b is measured on photos of another size" in warnings[0]
+
+
 def test_labels_tell_runs_apart(runs, tmp_path):
     for parent in ("a", "b"):
         shutil.copytree(runs[1], tmp_path / parent / "run")

@@ -312,8 +312,11 @@ def collect_measures(runs: Sequence[ComparedRun]) -> dict:
     return {"compared_splats": max(round(count), 1), "runs": rows, "answers": recommend_runs(runs)}
 
 
-def label_runs(runs: Sequence[Path]) -> list[str]:
+def label_runs(runs: Sequence[Path], warn: Warn = ignore) -> list[str]:
     """Return labels of finished runs: the method, with the folder's name where methods repeat.
+
+    Args:
+        warn: receives warnings about runs whose photos have another size or exposure.
 
     Raises:
         LodgsError: a run is not finished or named twice, or the runs have different scenes or held-out
@@ -325,6 +328,11 @@ def label_runs(runs: Sequence[Path]) -> list[str]:
             raise LodgsError(
                 f"Cannot compare {run} with {runs[0]}: their scenes or held-out photos differ.",
                 "Choose runs of one scene.",
+            )
+        if (job.image_scale, job.exposure) != (jobs[0].image_scale, jobs[0].exposure):
+            warn(
+                f"{run} is measured on photos of another size or exposure than {runs[0]}, so that their "
+                "quality differs for this reason, too. Train both with the same image_scale and exposure."
             )
     methods = [METHODS[job.method].label for job in jobs]
     names = [run.resolve().name for run in runs]

@@ -44,7 +44,7 @@ def compare(
     Args:
         runs: run folders. A run without levels of detail is also compared with neighbours merged.
         out: folder of the page. It is created.
-        warn: receives warnings about the scene.
+        warn: receives warnings about the scene and the runs.
         notify: receives one sentence for each part of the work.
         lpips: archive of the weights of LPIPS, see ``evaluate.lpips.load_lpips``.
 
@@ -56,7 +56,7 @@ def compare(
     Raises:
         LodgsError: a run is not finished, the runs have different scenes, or a file cannot be written.
     """
-    labels = label_runs(runs)
+    labels = label_runs(runs, warn)
     measured = [
         measure_run(run, label, _default_values(run), warn, notify, lpips)
         for run, label in zip(runs, labels, strict=True)
