@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -20,6 +21,7 @@ from training.runs.comparison.measures import (
     compared_run,
     label_runs,
     measure_run,
+    merge_baseline,
     recommend_runs,
 )
 from training.runs.comparison.page import build_page, compare
@@ -107,6 +109,17 @@ def test_single_level_is_also_compared_with_merged_neighbours(report, splats):
     counts = [round(len(splats) * share) for share in (0.0625, 0.125, 0.25, 0.5, 1)]
     assert [point["splats"] for point in merged["points"]] == counts
     assert merged["points"][-1]["psnr"] == plain["points"][-1]["psnr"]
+
+
+@pytest.mark.parametrize(
+    ("count", "names"),
+    [(1, ["Finest level"]), (3, ["Merged to 25%", "Merged to 50%", "Finest level"])],
+)
+def test_baseline_of_few_splats_has_each_number_once(splats, count, names):
+    row = {"psnr": 1.0, "ssim": 1.0, "drawn": 1, "frame_s": 1.0}
+    evaluation = SimpleNamespace(prefix="", measure_splats=lambda part: {**row, "splats": len(part)})
+    run, _ = merge_baseline(evaluation, splats.select(slice(0, count)), "3DGS")
+    assert [point.name for point in run.points] == names
 
 
 def test_report_newer_than_the_bundle_is_not_measured_again(runs, report, monkeypatch):

@@ -221,7 +221,8 @@ def merge_baseline(
     merged, sets, names = splats, {len(splats): splats}, {len(splats): "Finest level"}
     for share in MERGED_SHARES:
         merged = merge(merged, max(round(len(splats) * share), 1))
-        sets[len(merged)], names[len(merged)] = merged, f"Merged to {100 * share:g}%"
+        if len(merged) not in sets:  # of few splats, several shares have as many
+            sets[len(merged)], names[len(merged)] = merged, f"Merged to {100 * share:g}%"
     points = [
         Point.of(evaluation.measure_splats(part), names[count], evaluation.prefix)
         for count, part in sorted(sets.items())
