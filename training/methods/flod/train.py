@@ -24,6 +24,7 @@ from ...optimize.initialize import (
     from_splats,
     initial_points,
     neighbor_distances,
+    sample_points,
     to_splats,
 )
 from ...optimize.merged_levels import MergedLevels
