@@ -50,6 +50,9 @@ _MAX_LARGE = 0.05
 """Maximum share of large splats to report; a scene with more consists of them."""
 _AROUND, _INSIDE = (1.2, 1.6, 2.2), (0.15, 0.4, 0.7)
 """Distances of candidate viewpoints from the center in radii, outside an object and inside a hollow scene."""
+_ROOM_DEPTH = 0.5
+"""Depth in radii to which depths in views of a hollow scene are relative. Relative to the distance from the
+center, views near the center would always seem to see farthest."""
 _ELEVATIONS = np.radians([12.0, 25.0]), np.radians([0.0, 8.0])
 """Elevations of candidate viewpoints, outside an object and inside a hollow scene."""
 _AZIMUTHS = 24
@@ -124,7 +127,7 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Return the position (3,) and target (3,) of a view that shows a scene, float64; None for few splats.
 
     Candidates circle the center of the scene, or are inside a hollow one. The best one sees far, relative to
-    its distance from the center, and through few splats near to it.
+    its distance from the center or to the size of a hollow scene, and through few splats near to it.
 
     Args:
         up: (3,) unit up direction.
@@ -143,12 +146,13 @@ def choose_view(splats: Splats, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     north = np.cross(up, east)
     best, best_score = None, -1.0
     for distance in radius * np.array(_INSIDE if hollow else _AROUND):
+        unit = _ROOM_DEPTH * radius if hollow else distance
         for elevation in _ELEVATIONS[int(hollow)]:
             for angle in np.linspace(0, 2 * np.pi, _AZIMUTHS, endpoint=False):
                 across = np.cos(angle) * east + np.sin(angle) * north
                 position = center + distance * (np.cos(elevation) * across + np.sin(elevation) * up)
                 pose = look_at(position, center, up)
-                score = _clarity(sample.means, sizes, opacities, pose, distance, share)
+                score = _clarity(sample.means, sizes, opacities, pose, unit, share)
                 if score > best_score:
                     best, best_score = position, score
     return None if best is None else (best, center)
@@ -256,10 +260,10 @@ def _clarity(
     sizes: np.ndarray,
     opacities: np.ndarray,
     pose: np.ndarray,
-    distance: float,
+    unit: float,
     share: float = 1.0,
 ) -> float:
-    """Return the mean depth of the nearest splats over the view, relative to ``distance`` and at most 1.5.
+    """Return the mean depth of the nearest splats over the view, relative to ``unit`` and at most 1.5.
 
     Splats near the camera reduce it by the share of the view that they cover. Cells of the grid that splats
     hardly cover count 0.3.
@@ -271,16 +275,16 @@ def _clarity(
     x, y, z = local.T
     width, height = _GRID
     tangents = _TANGENT, _TANGENT * height / width
-    front = (z > 0.02 * distance) & (np.abs(x) < tangents[0] * z) & (np.abs(y) < tangents[1] * z)
+    front = (z > 0.02 * unit) & (np.abs(x) < tangents[0] * z) & (np.abs(y) < tangents[1] * z)
     x, y, z, sizes, opacities = x[front], y[front], z[front], sizes[front], opacities[front]
     covered = opacities * np.minimum((2 * sizes / z) ** 2 * np.pi / (4 * tangents[0] * tangents[1]), 1)
-    veil = float(covered[z < 0.4 * distance].sum())
+    veil = float(covered[z < 0.4 * unit].sum())
     column = ((x / z / tangents[0] + 1) / 2 * width).astype(int).clip(0, width - 1)
     row = ((y / z / tangents[1] + 1) / 2 * height).astype(int).clip(0, height - 1)
     nearest, cell = np.full(width * height, np.inf), row * width + column
     np.minimum.at(nearest, cell, z)
     coverage = np.bincount(cell, covered, width * height) * width * height / share
-    ratios = np.where(coverage >= _MIN_COVERAGE, np.minimum(nearest / distance, 1.5), 0.3)
+    ratios = np.where(coverage >= _MIN_COVERAGE, np.minimum(nearest / unit, 1.5), 0.3)
     return float(ratios.mean() * np.exp(-veil))
 
 

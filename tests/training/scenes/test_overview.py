@@ -1,10 +1,12 @@
 """Up direction, extent and first view of splats without cameras, on scenes of simple shapes."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from training.scenes.cameras import look_at
 from training.scenes.overview import (
     _clarity,
     central_ball,
@@ -148,6 +150,20 @@ def test_view_of_a_furnished_room_is_from_inside():
     open_air = means[means[:, 2] < 1.2]  # without a ceiling
     position, _ = choose_view(splats_at(open_air, 0.1), np.float64([0, 0, 1]))
     assert not (np.abs(position) < half).all()
+
+
+def test_view_of_a_room_shows_the_furniture():
+    """A sofa in the middle has an eighth of the splats. It is completely in the image."""
+    half, sofa, middle = np.float64([(3, 4, 1.4), (0.9, 0.4, 0.4), (0, 0.5, -1)])
+    walls = box_faces(tuple(half))
+    filled = np.random.default_rng(7).uniform(-1, 1, (len(walls) // 7, 3)) * sofa + middle
+    up = np.float64([0, 0, 1])
+    position, target = choose_view(splats_at(np.concatenate([walls, filled]), 0.1), up)
+    assert (np.abs(position) < half).all()
+    pose = look_at(position, target, up)
+    corners = middle + sofa * list(itertools.product((-1, 1), repeat=3))
+    x, y, z = pose[:3, :3] @ corners.T + pose[:3, 3:]
+    assert (z > 0.1).all() and (np.abs(x) < 0.7 * z).all() and (np.abs(y) < 0.7 * 9 / 16 * z).all()
 
 
 @pytest.mark.parametrize("case", ["brush", "postshot", "outliers"])
