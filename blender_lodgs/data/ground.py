@@ -109,7 +109,7 @@ def measure_distance(positions: np.ndarray) -> float:
     """
     if len(positions) != 2:
         raise LodgsError(
-            f"Cannot measure a length: {len(positions):,} points are selected, but two are needed.",
+            f"Cannot measure a length: it needs two selected points, not {len(positions):,}.",
             "Select two points in Edit Mode, or two empties.",
         )
     distance = float(np.linalg.norm(positions[1] - positions[0]))

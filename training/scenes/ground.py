@@ -42,7 +42,7 @@ def fit_plane(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarra
     points = np.asarray(points, np.float64).reshape(-1, 3)
     if len(points) < 3:
         raise LodgsError(
-            f"Cannot fit a ground plane to {len(points)} selected points: it needs at least three.",
+            f"Cannot fit a ground plane: it needs three selected points or more, not {len(points)}.",
             "Select points of the ground in Edit Mode, or empties on it.",
         )
     middle = points.mean(axis=0)

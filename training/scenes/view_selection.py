@@ -135,7 +135,7 @@ class ViewCollector:
             case [name]:
                 messages.append(f"Skipped {quote_name(name)}: {folder} has no such file.")
             case names:
-                more = ", ..." if len(names) > MAX_NAMED else ""
+                more = f" and {len(names) - MAX_NAMED:,} more" if len(names) > MAX_NAMED else ""
                 messages.append(
                     f"Skipped {len(names):,} views without a file in {folder}: "
                     f"{', '.join(map(quote_name, names[:MAX_NAMED]))}{more}."

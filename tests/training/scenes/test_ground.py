@@ -83,7 +83,7 @@ def test_fit_plane_is_exact_for_three_points_and_least_squares_for_more():
 
 @pytest.mark.parametrize(
     "points,message",
-    [([[0, 0, 0], [1, 1, 1]], "2 selected points"), ([[0, 0, 0], [1, 1, 1], [3, 3, 3.0]], "on a line"),
+    [([[0, 0, 0], [1, 1, 1]], "or more, not 2"), ([[0, 0, 0], [1, 1, 1], [3, 3, 3.0]], "on a line"),
      ([[1, 2, 3]] * 3, "on a line")],
 )  # fmt: skip
 def test_degenerate_points_are_rejected(points, message):
