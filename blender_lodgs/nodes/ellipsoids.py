@@ -16,8 +16,10 @@ from .building import VERSION, Nodes, add_switched_modifier, ensure_group, is_ed
 
 NAME = "LODGS Ellipsoids"
 MATERIAL = "LODGS Ellipsoids"
-MATERIAL_VERSION = 2
+MATERIAL_VERSION = 3
 ALPHA = "splat_opacity"
+HIDDEN = "lodgs_hides_ellipsoids"
+"""Custom property of view layers: 1 makes all ellipsoids transparent, also those of instances."""
 MIN_ALPHA = math.exp(-(3.0**2) / 2)
 """Alpha at the surface of an ellipsoid, 1 %. An opaque one has a radius of three standard deviations."""
 BOUNCES = 512
@@ -53,7 +55,7 @@ def raise_bounces(cycles: bpy.types.PropertyGroup, bounced_light_only: bool) -> 
 
 def ellipsoids() -> bpy.types.GeometryNodeTree:
     """Return the node group."""
-    return ensure_group(NAME, 3, _build)
+    return ensure_group(NAME, 4, _build)
 
 
 def _build(nodes: Nodes) -> None:
@@ -146,7 +148,9 @@ def _build_falloff(tree: bpy.types.NodeTree) -> None:
         "MULTIPLY", geometry.outputs["Backfacing"], nodes.math("MULTIPLY", starts_inside, passed_center)
     )
     enters = nodes.math("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
-    factor = nodes.math("MULTIPLY", alpha, nodes.math("ADD", enters, exits))
+    hidden = add("ShaderNodeAttribute", attribute_name=HIDDEN, attribute_type="VIEW_LAYER").outputs["Fac"]
+    visible = nodes.math("SUBTRACT", nodes.math("ADD", enters, exits), hidden)
+    factor = nodes.math("MULTIPLY", alpha, nodes.math("MAXIMUM", visible, 0.0))
     color = add("ShaderNodeAttribute", attribute_name=COLOR, attribute_type="INSTANCER")
     emission, transparent, mix = (
         add(kind) for kind in ("ShaderNodeEmission", "ShaderNodeBsdfTransparent", "ShaderNodeMixShader")

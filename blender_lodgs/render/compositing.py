@@ -16,6 +16,7 @@ from ..data import cleaning, ground, metadata, roots
 from ..data.placement import placement_of
 from ..data.properties import RenderSettings
 from ..data.property_callbacks import ON_CHANGE
+from ..nodes import ellipsoids
 from . import engine
 from .compositor_nodes import ALPHA_OVER, MIN_DEPTH, TreeBuilder
 
@@ -88,10 +89,10 @@ def combine_with_meshes(scene: bpy.types.Scene, mesh_engine: str = "CYCLES") -> 
         rendered.render.film_transparent = True
         for layer in rendered.view_layers:
             layer.use_pass_z = True
+    built = MIN_DEPTH in _node_types(tree), _used_catcher_layer(tree)  # nodes forget a removed layer
     catchers = _catcher_layer(scene, meshes)
     copy_settings(scene, meshes, scene.lodgs_render.shadows)
     meshes.lodgs_render.ellipsoids = scene.lodgs_render.shadows
-    built = MIN_DEPTH in _node_types(tree), _used_catcher_layer(tree)
     needed = not scene.lodgs_render.holdout, catchers
     if is_new or (_is_ours(tree) and built != needed):
         _build_nodes(tree, *needed, scene, meshes)
@@ -161,9 +162,10 @@ def _catcher_layer(scene: bpy.types.Scene, meshes: bpy.types.Scene) -> str:
     """
     has_catchers = any(obj.is_shadow_catcher for obj in scene.objects)
     layers, needs_own = meshes.view_layers, has_catchers and scene.lodgs_render.shadows
-    if needs_own and CATCHERS not in layers:
-        layers.new(CATCHERS).use_pass_z = True
-    elif not needs_own and CATCHERS in layers:
+    if needs_own:
+        layer = layers.get(CATCHERS) or layers.new(CATCHERS)
+        layer.use_pass_z, layer[ellipsoids.HIDDEN] = True, 1.0  # instances of splats cannot be excluded
+    elif CATCHERS in layers:
         layers.remove(layers[CATCHERS])
     return CATCHERS if needs_own else layers[0].name if has_catchers else ""
 

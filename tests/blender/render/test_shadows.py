@@ -119,7 +119,7 @@ def test_mesh_casts_a_shadow_on_the_ground_of_splats(bpy, lodgs, scene, renderer
     assert bpy.ops.lodgs.add_shadow_catcher() == {"FINISHED"}
     use_cycles(scene.lodgs_render.meshes, 4)
     scene.lodgs_render.meshes.cycles.max_bounces = 0
-    image = rendered(bpy, scene, tmp_path / "combined.exr")
+    combined = image = rendered(bpy, scene, tmp_path / "combined.exr")
 
     points = ground_points(bpy, scene)
     low, high = np.array([-1.5, 0, 1.1]), np.array([-0.5, 1, 2.1])
@@ -136,12 +136,17 @@ def test_mesh_casts_a_shadow_on_the_ground_of_splats(bpy, lodgs, scene, renderer
     assert image[shadow & clear][:, 0].max() < 0.1 * alone[shadow & clear][:, 0].min()
     lit = ~shadow & clear
     np.testing.assert_allclose(image[lit], alone[lit], atol=0.01)
-    # splats that shadow meshes do not shadow the catcher
+    # splats that shadow meshes do not shadow the catcher, nor does an instance between it and the sun
+    instance = bpy.data.objects.new("instance", None)
+    instance.instance_type, instance.location = "COLLECTION", -20 * SUN
+    instance.instance_collection = root.lodgs.levels[0].object.users_collection[0]
+    scene.collection.objects.link(instance)
     scene.lodgs_render.shadows = True
     image = rendered(bpy, scene, tmp_path / "with_splat_shadows.exr")
     assert image[shadow & clear][:, 0].max() < 0.1 * alone[shadow & clear][:, 0].min()
     np.testing.assert_allclose(image[lit], alone[lit], atol=0.01)
     scene.lodgs_render.shadows = False
+    np.testing.assert_array_equal(rendered(bpy, scene, tmp_path / "again.exr"), combined)
     # the catcher holds out no splats
     assert bpy.ops.lodgs.render_mesh_depth() == {"FINISHED"}
     held = rendered(bpy, scene, tmp_path / "held.exr")
