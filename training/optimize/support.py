@@ -32,8 +32,8 @@ FREE_SHARE = 0.7
 """Share of the depth of observed points in front of which no splat may stand."""
 POINT_DISTANCE = 0.03
 """Distance from a scene point up to which splats are supported, as a fraction of their depth."""
-TESTED_PHOTOS = 8
-"""Number of photos whose observed points are tested at a time."""
+MAX_PHOTOS, MAX_TESTS = 8, 500_000
+"""Maximum numbers of photos whose observed points are tested at a time, and of pairs of splat and photo."""
 MAX_SUPPORTING_POINTS = 200_000
 """Maximum number of scene points that support splats."""
 MIN_PHOTOS = 2
@@ -135,15 +135,15 @@ class ObservedSpace:
         """Find points (N, 3) in front of ``FREE_SHARE`` of the free depths of some photos.
 
         Args:
-            turn: number of the test. Consecutive tests use different photos, ``TESTED_PHOTOS`` each.
+            turn: number of the test. Consecutive tests use different photos, at most ``MAX_PHOTOS`` each.
 
         Returns:
             (N,) bool.
         """
         intruding = np.zeros(len(means), bool)
-        count = len(self._photos)
-        for k in range(min(TESTED_PHOTOS, count)):
-            camera, free_depths = self._photos[(turn * TESTED_PHOTOS + k) % count]
+        tested = max(min(MAX_PHOTOS, len(self._photos), MAX_TESTS // max(len(means), 1)), 1)
+        for photo in range(turn * tested, (turn + 1) * tested) if self._photos else ():
+            camera, free_depths = self._photos[photo % len(self._photos)]
             rows, columns = free_depths.shape
             (x, y), depths = (values.T for values in camera.project(means))
             inside = np.flatnonzero(

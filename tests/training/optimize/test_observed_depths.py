@@ -135,3 +135,9 @@ def test_each_test_uses_other_photos():
     means = np.array([(0, 0, 4), (0, 0, -4)], np.float32)
     assert space.find_intruding(means, 0).tolist() == [True, False]
     assert space.find_intruding(means, 1).tolist() == [True, True]  # photos 8, 0, 1, ...
+    many = np.repeat(means, 400_000, 0)  # only one photo at a time
+    assert [space.find_intruding(many, turn)[[0, -1]].tolist() for turn in (0, 8, 9)] == [
+        [True, False],
+        [False, True],
+        [True, False],
+    ]
