@@ -174,7 +174,7 @@ class Method(ABC, Generic[P, D]):
         self.margins = MarginGenerator(data, p.margin, backend)
         self.region = GrowthRegion(data.region)
         self.sh_degree = ShSchedule(p.sh_degree, p.sh_interval)
-        self.support = SupportPruning(data.scene, data.train, p.free_depth, p.largest)
+        self.support = SupportPruning(data.scene, data.train, p.free_depth, p.largest, base is None)
         self.setup(base)
 
     # -- to define -------------------------------------------------------------------------------------

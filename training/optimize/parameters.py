@@ -47,8 +47,8 @@ class Parameters:
         0.5,
         "Remove splats closer to a training camera, or to the midpoint of two neighbouring cameras, than "
         "this fraction of its nearest scene points. Within the same distance outside the frame, keep only "
-        "splats seen by two or more photos. Also remove splats far in front of the points that a photo "
-        "observes around their pixel. 0 disables all.",
+        "splats seen by two or more photos. Without a base, also remove splats far in front of the points "
+        "that a photo observes around their pixel. 0 disables all.",
         high=1,
     )
     largest: float = setting(

@@ -166,16 +166,25 @@ class SupportPruning:
         free_depth: share of the nearest depth that is free space; 0 disables.
         largest: maximum standard deviation of a splat, as a share of its distance from the nearest camera
             or midpoint; 0 disables.
+        use_observations: also remove splats from :class:`ObservedSpace`, unless ``free_depth`` is 0.
 
     Attributes:
         end: step from which nothing is removed or limited.
     """
 
-    def __init__(self, scene: Scene, cameras: Sequence[Camera], free_depth: float, largest: float) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        free_depth: float,
+        largest: float,
+        use_observations: bool = True,
+    ) -> None:
         self._scene = scene
         self._cameras = cameras
         self._free_depth = free_depth
         self._largest = largest
+        self._use_observations = use_observations
         self.end = inf
 
     @cached_property
@@ -202,6 +211,7 @@ class SupportPruning:
             model.lower_log_scales(torch.from_numpy(np.log(sizes)).float())
         if self._free_depth:
             intruding = self._support.find_intruding(means, distances, positions, self._free_depth)
-            intruding |= self._observed_space.find_intruding(means, step // PRUNE_INTERVAL)
+            if self._use_observations:
+                intruding |= self._observed_space.find_intruding(means, step // PRUNE_INTERVAL)
             model.keep(torch.from_numpy(~intruding))
             require_rows(model, step, "free_depth")

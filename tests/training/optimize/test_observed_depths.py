@@ -4,11 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from training.optimize import observed_depths
 from training.optimize.initialize import initial_points
+from training.optimize.model import Model
 from training.optimize.observed_depths import photo_parts, points_between
-from training.optimize.support import ObservedSpace
+from training.optimize.support import ObservedSpace, SupportPruning
 from training.scenes.cameras import Camera
 
 WALL, HALF = 10.0, 5.0
@@ -141,3 +143,16 @@ def test_each_test_uses_other_photos():
         [False, True],
         [True, False],
     ]
+
+
+@pytest.mark.parametrize("use_observations", [True, False])
+def test_pruning_uses_observations_unless_disabled(use_observations):
+    """A splat at 0.6 of the wall's depth is beyond the free space around cameras, which is half of it."""
+    row = {
+        "means": torch.tensor([(0.0, 0.0, 6.0), (0.0, 0.0, 9.0)]),
+        "log_scales": torch.zeros(2, 3),
+    }
+    model = Model(row, dict.fromkeys(row, 0.01))
+    scene = scene_of(plane())
+    SupportPruning(scene, [camera("a"), camera("b")], 0.5, 0.0, use_observations).prune(model, 0)
+    assert model["means"][:, 2].tolist() == ([9] if use_observations else [6, 9])
