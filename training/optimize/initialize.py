@@ -21,7 +21,8 @@ from .observed_depths import points_between
 MIN_POINTS = 4
 """Minimum number of distinct points to start from."""
 MAX_START = 0.5
-"""Maximum share of all splats to start from with splats between the scene's points; others are densified."""
+"""Maximum number of initial splats if some lie between the scene's points, as a share of the limit. Density
+control adds the others."""
 
 
 def drop_duplicates(points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

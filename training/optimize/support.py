@@ -1,4 +1,4 @@
-"""Free space around the training cameras, and the bounds on splats that follow from it."""
+"""Free space around the training cameras and along their rays, and the bounds on splats that follow."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ class SupportPruning:
 
     @torch.no_grad()
     def prune(self, model: Model, step: int) -> None:
-        """Remove splats too close to the training views, and limit the size of the others.
+        """Remove splats near training views or far in front of observed points, and limit the others' size.
 
         Raises:
             LodgsError: no splats remain.

@@ -121,3 +121,32 @@ def test_harmonics_degrees_join_one_by_one(data):
     method.train_step(0)
     assert not method.model["sh"][:, 1:].any()
     assert torch.isfinite(method.model["sh"]).all()
+
+
+@pytest.mark.parametrize(("name", "levels"), [("3dgs", {}), ("flod", {"levels": 1})])
+def test_opacities_fall_while_splats_are_added(data, name, levels):
+    """By the decay times the strength for 6 of 40 photos, at the removal of transparent splats only."""
+    method = make(data, name, steps=20, densify_interval=1000, densify_until=0.5, prune_interval=2,
+                  min_opacity=0.0, opacity_decay=0.2, margin=0.0, **levels)  # fmt: skip
+    assert len(data.train) == 6
+    expected = method.model.read("opacity_logits").sigmoid().clone()
+    for step, factor in ((0, 1.0), (1, 1 - 0.2 * (1 - 6 / 40)), (11, 1.0)):
+        method.control_density(step)
+        expected *= factor
+        torch.testing.assert_close(method.model.read("opacity_logits").sigmoid(), expected)
+
+
+@pytest.mark.parametrize("name", ["3dgs", "flod"])
+def test_training_starts_with_splats_between_points(data, name, monkeypatch):
+    between = np.array([[0.25] * 3, [0.5] * 3, [0.75] * 3], np.float32)
+    limits = []
+
+    def points_between(scene, cameras, limit, seed):
+        limits.append(limit)
+        return between, np.full((3, 3), 128, np.uint8)
+
+    monkeypatch.setattr("training.optimize.initialize.points_between", points_between)
+    method = make(data, name, points_between=0.5, max_splats=10_000)
+    means = method.model.read("means").numpy()
+    assert limits == [round(0.5 * (len(means) - 3))]
+    assert {tuple(point) for point in between} <= {tuple(mean) for mean in means}
