@@ -112,7 +112,7 @@ class Step:
 
     def __call__(self) -> None:
         if model := make_step_model(self.backend, self.adam, {}):
-            options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0))
+            options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), sparse_sh=True)
             model.step(self.camera, self.target, options)()
             return
         self.adam.zero_grad()

@@ -152,7 +152,7 @@ class Case:
         assert model is not None
         if isinstance(model, GpuModel) and not recorded:
             model._capacity = None
-        options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), shrink=1)
+        options = StepOptions(near=0.01, sh_degree=3, background=(0.0, 0.0, 0.0), shrink=1, sparse_sh=True)
         return lambda: model.step(self.camera, self.target, options)
 
 

@@ -42,6 +42,11 @@ class Parameters:
     min_opacity: float = setting(0.005, "Remove splats below this opacity.", high=1)
     sh_degree: int = setting(3, "Degree of spherical harmonics for view-dependent colour, 0 to 3.", high=3)
     sh_interval: int = setting(250, "Steps between increases of the harmonics' degree.", unit="steps")
+    sparse_sh: bool = setting(
+        True,
+        "Change the harmonics only of splats in the image of a step. Those of others keep their values and "
+        "moments, instead of an Adam step with zero gradients, which takes longer.",
+    )
     ssim_weight: float = setting(0.2, "Weight of D-SSIM relative to L1 in the loss.", high=1)
     free_depth: float = setting(
         0.5,
@@ -282,6 +287,7 @@ STANDARD: dict[str, Any] = {
 AS_PUBLISHED: dict[str, Any] = {
     "max_splats": 0,
     "scale_threshold": False,
+    "sparse_sh": False,
     "free_depth": 0.0,
     "largest": 0.0,
     "random_background": False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -64,10 +65,19 @@ class Adam:
         return self.lr[name], self.betas, self.eps, self.steps[name]
 
     @torch.no_grad()
-    def step(self, grads: Mapping[str, torch.Tensor] | None = None) -> None:
-        """Make one step in place with ``grads`` or the tensors' own gradients; skip tensors without a
-        gradient."""
-        from .cpu.adam import update
+    def step(
+        self,
+        grads: Mapping[str, torch.Tensor] | None = None,
+        trained: Mapping[str, torch.Tensor] = MappingProxyType({}),
+    ) -> None:
+        """Make one step in place; skip tensors without a gradient.
+
+        Args:
+            grads: gradients by name; None uses the tensors' own.
+            trained: rows to change by name, (N,) bool; others keep their values and moments. Of tensors
+                without an entry, all rows change.
+        """
+        from .cpu.adam import update, update_rows
         from .cuda.adam import update as update_on_gpu
 
         for name, tensor in self.tensors.items():
@@ -75,11 +85,15 @@ class Adam:
             if gradient is None:
                 continue
             arrays = tensor.detach(), gradient.contiguous(), *self.state[name]
-            constants = self.count_step(name)
-            if tensor.device.type == "cpu":
+            constants, rows = self.count_step(name), trained.get(name)
+            if tensor.device.type != "cpu":
+                update_on_gpu(*arrays, *constants, rows)
+            elif rows is None:
                 update(*(array.numpy() for array in arrays), *constants)
             else:
-                update_on_gpu(*arrays, *constants)
+                index = torch.nonzero(rows).squeeze(1)
+                arrays = arrays[0], index, arrays[1][index], *arrays[2:]
+                update_rows(*(array.numpy() for array in arrays), *constants)
 
     @torch.no_grad()
     def step_rows(self, rows: torch.Tensor, grads: Mapping[str, torch.Tensor | None]) -> None:

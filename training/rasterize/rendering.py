@@ -109,6 +109,7 @@ class StepOptions:
         shrink: factor by which the photo was downscaled; used to scale the density statistics. None collects
             no statistics.
         drawn_only: splats of weight 0 keep their values and moments, instead of a step with zero gradients.
+        sparse_sh: the same for harmonics of splats outside the image.
     """
 
     near: float
@@ -119,6 +120,7 @@ class StepOptions:
     min_scale: float = 0.0
     shrink: float | None = None
     drawn_only: bool = False
+    sparse_sh: bool = False
 
 
 @dataclass

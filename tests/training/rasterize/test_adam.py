@@ -71,6 +71,32 @@ def test_gpu_kernel_matches_cpu_kernel(fake_card, lr):
     assert not on_gpu[1].any() and not on_gpu[2].any(), "tiny moments become zero"
 
 
+def test_steps_can_change_some_rows(fake_card):
+    """Other rows keep their values and moments, on the CPU and with the kernel of cards."""
+    start = torch.randn(300, 4, 3, generator=torch.Generator().manual_seed(7))
+    trained = torch.arange(300) % 3 == 0
+    adam = Adam({"sh": start.clone(), "means": start[:, 0].clone()}, {"sh": 1e-2, "means": 1e-2})
+    on_gpu = [start.clone(), torch.zeros_like(start), torch.zeros_like(start)]
+    for step in range(1, 4):
+        gradient = gradients(step, start.shape)
+        adam.step({"sh": gradient, "means": gradient[:, 0].contiguous()}, {"sh": trained})
+        update_on_gpu(on_gpu[0], gradient, *on_gpu[1:], 1e-2, (0.9, 0.999), 1e-15, step, trained)
+    complete = Adam({"sh": start.clone()}, {"sh": 1e-2})
+    for step in range(1, 4):
+        complete.step({"sh": gradients(step, start.shape)})
+    for row, all_rows, actual in zip(
+        (adam.tensors["sh"], *adam.state["sh"]),
+        (complete.tensors["sh"], *complete.state["sh"]),
+        on_gpu,
+        strict=True,
+    ):
+        assert torch.equal(row[trained], all_rows[trained])
+        torch.testing.assert_close(actual, row, atol=2e-6, rtol=2e-5)
+    assert torch.equal(adam.tensors["sh"][~trained], start[~trained])
+    assert not any(moment[~trained].any() for moment in adam.state["sh"])
+    assert (adam.tensors["means"] != start[:, 0]).all()
+
+
 def test_resumed_optimizer_is_bit_identical():
     def run(adam, tensors, steps):
         for step in steps:

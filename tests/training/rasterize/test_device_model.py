@@ -208,6 +208,41 @@ def test_steps_can_leave_ignored_splats_unchanged(graphics, make_splats, odd_cam
             assert not torch.equal(after[10:], values[10:]), name
 
 
+@pytest.mark.parametrize("backend", ["cpu", "cuda", "gpu"])
+def test_steps_can_leave_harmonics_outside_the_image_unchanged(
+    fake_card, graphics, make_splats, odd_camera, photo, backend
+):
+    """Other parameters make a step of Adam with zero gradients, as do all without ``sparse_sh``."""
+    for sparse_sh in (False, True):
+        splats = make_splats(50)
+        adam = adam_of(splats)
+        model = make_step_model(backend, adam, zero_stats(50))
+        assert model is not None
+        model.step(odd_camera, photo, StepOptions(**VIEW))
+        if backend == "gpu":
+            model.copy_to_host()
+        before = {name: tensor.detach().clone() for name, tensor in adam.tensors.items()}
+        shifted = odd_camera.world_to_camera.copy()
+        shifted[0, 3] += 2  # some splats leave the image
+        camera = replace(odd_camera, world_to_camera=shifted)
+        drawn = (
+            rasterize(Gaussians(**before), camera, near=VIEW["near"], min_scale=VIEW["min_scale"]).radii > 0
+        )
+        assert 5 < drawn.sum() < 45
+        model = make_step_model(backend, adam, zero_stats(50))
+        assert model is not None
+        model.step(camera, photo, StepOptions(sparse_sh=sparse_sh, **VIEW))
+        if backend == "gpu":
+            model.copy_to_host()
+        moved = {
+            name: (adam.tensors[name] != values).flatten(1).any(1)
+            for name, values in before.items()
+            if name != "opacity_logits"
+        }
+        assert moved.pop("sh")[~drawn].any() != sparse_sh
+        assert moved["means"][~drawn].any()
+
+
 def test_small_bindings_do_not_change_training(graphics, make_splats, odd_camera, photo, monkeypatch):
     """Bindings of 200 KB hold the moments of 512 of 1500 splats, and 4654 of 5700 pairs."""
     results = []

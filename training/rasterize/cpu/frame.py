@@ -119,7 +119,7 @@ class HostFrame:
 
     def project_backward(
         self, pair_sums: np.ndarray, gradients: Sequence[np.ndarray] | None, grad2d: np.ndarray,
-        steps: Sequence[tuple] | None = None,
+        steps: Sequence[tuple] | None = None, sparse_sh: bool = False,
     ) -> None:  # fmt: skip
         """Fill the gradients of the considered splats, and grad2d (N, 2).
 
@@ -127,6 +127,7 @@ class HostFrame:
             gradients: one array for each of the splats' arrays, of the same shape. If None, the parameters
                 make their Adam steps at once, and no gradients are stored.
             steps: for each parameter, the result of ``adam.step_arguments``.
+            sparse_sh: harmonics of splats outside the image make no step.
         """
         if gradients is None:
             gradients = [array[:0] for array in self._splats]
@@ -135,4 +136,5 @@ class HostFrame:
         run_parallel(
             project_backward, len(self.index), GRAIN, *self._splats, *self._settings, self.index,
             self.projected, *self._pair_rows, pair_sums, tuple(gradients), grad2d, steps,
+            sparse_sh,
         )  # fmt: skip

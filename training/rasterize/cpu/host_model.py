@@ -66,12 +66,12 @@ class HostModel:
         frame.differentiate(frame.projected, image, by_image, no_alpha, pair_sums)
         logits = None if options.shrink is None else adam.tensors["opacity_logits"].detach().clone()
         steps = [step_arguments(arrays[name], *adam.state[name], *adam.count_step(name)) for name in TENSORS]
-        frame.project_backward(pair_sums, None, grad2d.numpy(), steps)
+        frame.project_backward(pair_sums, None, grad2d.numpy(), steps, options.sparse_sh)
         if options.shrink is not None:
             accumulate_stats(self._stats, grad2d, radii, logits, options.shrink)
         if not options.drawn_only and len(frame.index) < count:
             others = np.setdiff1d(np.arange(count), frame.index, assume_unique=True)
-            for step in steps:
+            for step in steps[:-1] if options.sparse_sh else steps:
                 decay_rows(others, step)
         self._image = image, 1 - frame.transmittance
         return lambda: loss

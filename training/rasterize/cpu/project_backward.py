@@ -306,14 +306,15 @@ def step_range(begin, end, index, width, gradient, step):
 def project_backward(
     begin, end, means, quats, log_scales, opacity_logits, sh, weights,
     pose, lens, camera_position, width, height, degree, min_scale, antialias,
-    index, projected, first_pair, pair_count, pair_row, pair_sums, gradients, grad2d, steps,
+    index, projected, first_pair, pair_count, pair_row, pair_sums, gradients, grad2d, steps, sparse_sh,
 ):  # fmt: skip
     """Fill the gradients of the parameters and grad2d of the splats at ``index`` from the pairs' sums.
 
     ``gradients`` has one array per parameter. With ``steps``, the parameters make their Adam steps at once
     instead, and these arrays are empty. ``steps`` has the arguments of ``adam_values`` for each parameter,
     besides positions and gradients. Rates of harmonics are those of one splat, all others those of GRAIN
-    splats. Numba compiles a kernel for each case.
+    splats. Numba compiles a kernel for each case. With ``sparse_sh``, harmonics of splats outside the image
+    make no step.
     """
     by_means, by_quats, by_log_scales, by_logits, by_sh, by_weights = gradients
     if steps is not None:
@@ -349,7 +350,7 @@ def project_backward(
             grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
             if steps is None:
                 by_sh[i] = ZERO
-            else:
+            elif not sparse_sh:
                 flat_coefficients[:trained] = ZERO
                 step_harmonics(i, trained, flat_coefficients, steps[4])
         else:

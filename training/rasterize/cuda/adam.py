@@ -21,8 +21,13 @@ def update(
     betas: tuple[float, float],
     eps: float,
     step: int,
+    trained: torch.Tensor | None = None,
 ) -> None:
-    """Make one Adam step in place with one kernel; same formula as ``cpu.adam.update``."""
+    """Make one Adam step in place with one kernel; same formula as ``cpu.adam.update``.
+
+    Args:
+        trained: (N,) bool, rows to change; None changes all.
+    """
     rates, rate, width = None, 0.0, 1
     if isinstance(lr, float | int):
         rate = float(lr)
@@ -36,5 +41,5 @@ def update(
     count = parameter.numel()
     driver.kernels().launch(
         "adam", -(-count // THREADS), THREADS, parameter, gradient, m, v, rates, rate, width,
-        ctypes.c_longlong(count), *betas, first, second, eps,
+        ctypes.c_longlong(count), trained, count // max(len(parameter), 1), *betas, first, second, eps,
     )  # fmt: skip

@@ -61,7 +61,7 @@ class CardModel:
             rows = torch.nonzero(options.weights).squeeze(1)
             self._adam.step_rows(rows, {name: gradient[rows] for name, gradient in named.items()})
         else:
-            self._adam.step(named)
+            self._adam.step(named, {"sh": frame.projected.radii > 0} if options.sparse_sh else {})
         self._image = image, 1 - frame.light
         return lambda: float(loss.value)
 

@@ -717,12 +717,13 @@ extern "C" __global__ void compare_backward(
 // -- Adam ------------------------------------------------------------------------------------------------------------
 
 // Make an Adam step (Kingma and Ba 2015, Algorithm 1). Number i of the tensor has the rate rates[i % width], or rate.
+// Rows of row_width numbers change where trained is true; without it, all do.
 extern "C" __global__ void adam(
     float* values, const float* gradient, float* m, float* v, const float* rates, float rate, int width, long long count,
-    float keep_m, float keep_v, float first, float second, float eps
+    const bool* trained, int row_width, float keep_m, float keep_v, float first, float second, float eps
 ) {
     long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
-    if (i >= count) { return; }
+    if (i >= count || (trained && !trained[i / row_width])) { return; }
     float g = gradient[i];
     float moment = keep_m * m[i] + (1.0f - keep_m) * g, square = keep_v * v[i] + (1.0f - keep_v) * (g * g);
     moment = fabsf(moment) > 1e-30f ? moment : 0.0f;  // smaller moments are set to zero, as on the CPU

@@ -129,7 +129,7 @@ class GpuModel:
             if len(self._pending) == PENDING:
                 self._settle()
             photo = _upload_photo(self.device, target)
-            numbers = self._next_numbers(options.shrink, options.drawn_only)
+            numbers = self._next_numbers(options)
             step = Step(settings, photo, lens, options.ssim_weight, weights, numbers)
             self._start(step)
 
@@ -358,11 +358,12 @@ class GpuModel:
         columns = slice(TRAINED, TRAINED + 1)
         self._run("write_columns", columns, parts=self.device.upload(array), values=self._splats)
 
-    def _next_numbers(self, shrink: float | None, drawn_only: bool) -> np.ndarray:
+    def _next_numbers(self, options: StepOptions) -> np.ndarray:
         """Count a step of Adam; return the numbers of its ``ProjectedScene.train``."""
         adam = self._adam
         numbers = self._numbers
-        numbers[:5] = *adam.betas, adam.eps, shrink or 0.0, drawn_only
+        numbers[:4] = *adam.betas, adam.eps, options.shrink or 0.0
+        numbers[4:6] = options.drawn_only, options.sparse_sh
         for name, columns in self._rates.items():
             rate, betas, _, step = adam.count_step(name)
             first, second = (1 - beta**step for beta in betas)

@@ -23,6 +23,7 @@ struct View {
     eps: f32,
     shrink: f32,  // factor by which the photo was downscaled; 0 collects no statistics
     drawn_only: f32,  // if positive, splats of weight 0 keep their values and moments
+    sparse_sh: f32,  // if positive, so do harmonics of splats outside the image
     // learning rate and scale of second moments, for the trained numbers of a splat and its coefficients
     rates: array<vec4f, 43>,
 }
@@ -368,6 +369,7 @@ fn train(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) l
         let term = j / 3u;
         var g = 0.0;
         if (term < active_terms()) { g = bases[row * 25u + term] * colour_gradients[row][j % 3u]; }
-        if (is_trained(first + row)) { sh[first * width + k] -= adam(first + row, TRAINED + j, g); }
+        let drawn = u.sparse_sh == 0.0 || projected[first + row].radius > 0.0;
+        if (drawn && is_trained(first + row)) { sh[first * width + k] -= adam(first + row, TRAINED + j, g); }
     }
 }
