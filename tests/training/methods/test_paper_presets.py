@@ -28,6 +28,7 @@ OCTREE_PAGE = Path(__file__).parents[3] / "docs/methods/octree-gs-paper.md"
 SHARED = {
     "max_splats": (0, "no paper limits the number"),
     "scale_threshold": (False, "3DGS program: densify_grad_threshold is used unchanged"),
+    "sparse_sh": (False, "3DGS program: steps of Adam for all splats"),
     "ssim_weight": (0.2, "3DGS program: lambda_dssim; Octree-GS, Sec. 7.1"),
     "min_opacity": (0.005, "3DGS program: 0.005 in train.py; FLoD and Octree-GS programs: arguments"),
     "antialias": (False, "3DGS program: dilation"),
