@@ -46,6 +46,8 @@ def main() -> int:
     if run.state() == "done":  # resume an interrupted demo, repeat a finished one
         shutil.rmtree(run.path)
     os.environ.setdefault("LODGS_TRAINER_PYTHON", sys.executable)
+    download = [sys.executable, ROOT / "tools" / "viewer.py"]  # for the page, while training runs
+    subprocess.Popen(download, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     method = METHODS[options.method]
     print(f"Training {method.label} ({method.about}), draft preset, on {os.path.relpath(options.scene)}.")
