@@ -17,7 +17,8 @@ from ..rasterize import Adam, DeviceModel, Gaussians, Rendering, StepModel, make
 from ..rasterize.adam import LearningRate
 from ..rasterize.stats import PEAK_STATS, accumulate_stats
 from ..splats.gaussians import Splats
-from .parameters import Parameters
+from .parameters import DensityParameters, Parameters
+from .schedules import annealing, log_linear
 
 NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh")
 """Tensors of every splat. A model of splats may train further tensors, (N,), under other names."""
@@ -337,6 +338,15 @@ def splat_rates(parameters: Parameters, extent: float) -> dict[str, LearningRate
         "opacity_logits": p.lr_opacities,
         "sh": torch.tensor([[p.lr_sh], *higher_degrees]),
     }
+
+
+def rates_at(parameters: DensityParameters, extent: float, step: int, steps: int) -> dict[str, LearningRate]:
+    """Return the learning rates of NAMES at a step of ``steps``, by the schedules of a method."""
+    p = parameters
+    factor = annealing(step / steps, p.lr_final)
+    rates = {name: rate * factor for name, rate in splat_rates(p, extent).items()}
+    means = log_linear(p.lr_means, p.lr_means_final, step / (p.lr_means_steps or steps))
+    return rates | {"means": means * extent}
 
 
 def _check_compatible(

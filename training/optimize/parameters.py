@@ -232,6 +232,13 @@ class DensityParameters(FarViewParameters):
         high=0.9,
     )
     opacity_reset_interval: int = setting(0, "Steps between opacity resets. 0 disables.", unit="steps")
+    lr_final: float = setting(
+        0.1,
+        "Factor on the learning rates of scales, quaternions, opacities and colours at the end. They fall in "
+        "the last 15 % of the steps (FLoD: of a level). 1 keeps them.",
+        above=0,
+        high=1,
+    )
     lr_means_steps: int = setting(
         0,
         "Steps over which the learning rate of positions decays. 0 uses all steps (FLoD: of the level).",
@@ -302,6 +309,7 @@ PAPER: dict[str, Any] = AS_PUBLISHED | {
     "far_share": 0.0,
     "points_between": 0.0,
     "opacity_decay": 0.0,
+    "lr_final": 1.0,
     "long_axis": False,
     "opacity_reset_interval": 3000,
     "grad_threshold": 2e-4,

@@ -85,7 +85,8 @@ class RefiningMethod(SplatMethod):
 
     def set_learning_rates(self, step: int) -> None:
         if self.refines(step):  # the model is already trained
-            self.model.lr["means"] = self.parameters.lr_means_final * self.data.extent
+            p, extent = self.parameters, self.data.extent
+            self.model.lr.update(splat_rates(p, extent) | {"means": p.lr_means_final * extent})
         else:
             super().set_learning_rates(step)
 

@@ -19,6 +19,9 @@ becomes worse than its merge at small sizes."""
 FAR_END = 0.9
 """Share of the steps of a finest level after which all images have full size, for the finest details."""
 
+ANNEAL_FROM = 0.85
+"""Share of the steps of a level after which learning rates other than those of positions fall."""
+
 MANY_PHOTOS = 40
 """Number of training photos from which measures against overfitting are off."""
 
@@ -32,6 +35,11 @@ def log_linear(first: float, last: float, share: float) -> float:
     """Interpolate geometrically between two values; a ``share`` above 1 gives the last value."""
     share = min(share, 1.0)
     return float(first ** (1 - share) * last**share)
+
+
+def annealing(share: float, final: float) -> float:
+    """Return the factor on learning rates after a share of a level's steps, which falls to ``final``."""
+    return log_linear(1.0, final, max(share - ANNEAL_FROM, 0.0) / (1 - ANNEAL_FROM))
 
 
 def due(interval: int, step: int) -> bool:

@@ -22,9 +22,9 @@ from .density_control import (
 )
 from .initialize import from_points, from_splats, initial_points
 from .method import Drawing, Method
-from .model import Model, splat_rates
+from .model import Model, rates_at, splat_rates
 from .parameters import SplatParameters
-from .schedules import FAR_END, due, few_photos, log_linear, random_reduction, shrink_at
+from .schedules import FAR_END, due, few_photos, random_reduction, shrink_at
 from .training_data import TrainingView
 
 PRUNE_AT = (8 / 30, 16 / 30, 24 / 30)
@@ -76,9 +76,8 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         return step < self._densify_until
 
     def set_learning_rates(self, step: int) -> None:
-        p = self.parameters
-        rate = log_linear(p.lr_means, p.lr_means_final, step / (p.lr_means_steps or self.scheduled_steps))
-        self.model.lr["means"] = rate * self.data.extent
+        rates = rates_at(self.parameters, self.data.extent, step, self.scheduled_steps)
+        self.model.lr.update(rates)  # methods may train further tensors
 
     def control_density(self, step: int) -> None:
         p, model, completed = self.parameters, self.model, step + 1

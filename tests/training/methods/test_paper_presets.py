@@ -56,6 +56,7 @@ SPLATS = (
     | RATES
     | {
         "grad_threshold": (2e-4, "3DGS program: densify_grad_threshold"),
+        "lr_final": (1.0, "3DGS program: constant rates, except those of positions"),
         "lr_means_steps": (30_000, "3DGS program: position_lr_max_steps"),
         "clone_extent": (0.01, "3DGS program: percent_dense"),
         "long_axis": (False, "3DGS program: clone and split"),

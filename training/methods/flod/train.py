@@ -30,14 +30,13 @@ from ...optimize.initialize import (
 from ...optimize.merged_levels import MergedLevels
 from ...optimize.merging import merge
 from ...optimize.method import Drawing
-from ...optimize.model import Model, splat_rates
+from ...optimize.model import Model, rates_at, splat_rates
 from ...optimize.refining import refining_rates
 from ...optimize.schedules import (
     FAR_END,
     LevelStages,
     due,
     few_photos,
-    log_linear,
     random_reduction,
     shrink_at,
 )
@@ -173,9 +172,8 @@ class Method(method.Method[FlodParameters, Drawing]):
         if self.merged.refines(step):
             self.model.lr = self.merged.learning_rates(step)
             return
-        share = self.stages.local_step(step) / (p.lr_means_steps or self.stages.steps_at(step))
-        rate = log_linear(p.lr_means, p.lr_means_final, share) * self.data.extent
-        self.model.lr["means"] = rate
+        steps = self.stages.steps_at(step)
+        self.model.lr = rates_at(p, self.data.extent, self.stages.local_step(step), steps)
 
     def control_density(self, step: int) -> None:
         if self.is_finishing(step):

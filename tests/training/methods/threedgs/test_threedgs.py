@@ -109,6 +109,20 @@ def test_position_rate_decays_exponentially(data):
         assert method.model.adam.lr["means"] == pytest.approx(rate * data.extent)
 
 
+@pytest.mark.parametrize("name", ["3dgs", "flod", "clod"])
+def test_other_rates_fall_at_the_end(data, name):
+    """From 85 % of the steps on, by a factor of 0.1 ** ((share - 0.85) / 0.15), worked by hand."""
+    method = make(data, name, lr_final=0.1)
+    parameters = method.parameters
+    steps = parameters.stages[0][1] if name == "flod" else parameters.steps
+    for share, factor in ((0.0, 1.0), (0.849, 1.0), (0.925, 0.1**0.5), (1.0, 0.1)):
+        method.set_learning_rates(round(share * steps) - (share == 1))
+        lr = method.model.lr
+        assert lr["log_scales"] == pytest.approx(factor * parameters.lr_scales, rel=0.01)
+        assert lr["opacity_logits"] == pytest.approx(factor * parameters.lr_opacities, rel=0.01)
+        assert lr["sh"][0].item() == pytest.approx(factor * parameters.lr_sh, rel=0.01)
+
+
 def test_transparent_model_raises(data):
     method = make(data, steps=10, prune_interval=1, min_opacity=1.0)
     with pytest.raises(LodgsError, match=r"no splats remain at step 1.*Lower or disable 'min_opacity'"):
