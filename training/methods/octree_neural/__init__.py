@@ -135,6 +135,7 @@ METHOD = MethodInfo(
     unused=(
         "candidates",
         "sh_interval",
+        "sparse_sh",
         "dropout",
         "lr_means",
         "lr_means_final",
