@@ -380,26 +380,15 @@ class Method(ABC, Generic[P, D]):
             drawings[0].accumulate_stats(self.model, view.shrink)
         self.region.clear_outside(self.model, step)
         self.set_learning_rates(step)
-        if (optimizer := drawings[0].optimizer) is None:
-            optimizer = self.model.adam
-            optimizer.step(trained=self._trained_rows(drawings))
-        else:
+        optimizers = drawings[0].optimizer or self.model.adam, *self.extra_optimizers
+        for optimizer in (*optimizers, *self.exposure.optimizers(step / self.steps)):
             optimizer.step()
-        optimizer.zero_grad()
-        for additional in (*self.extra_optimizers, *self.exposure.optimizers(step / self.steps)):
-            additional.step()
-            additional.zero_grad()
+            optimizer.zero_grad()
         rendering = drawings[0].rendering
         image, alpha = rendering.image.detach(), rendering.alpha.detach()
         return StepResult(
             lambda: float(loss.detach()), lambda: self.background.remove(image, alpha, step), view.target
         )
-
-    def _trained_rows(self, drawings: Sequence[D]) -> dict[str, torch.Tensor]:
-        """Return the rows (N,) bool of harmonics to change in a step; see ``Adam.step``."""
-        if not self.parameters.sparse_sh or "sh" not in self.model.adam.tensors:
-            return {}
-        return {"sh": torch.stack([drawing.rendering.radii > 0 for drawing in drawings]).any(0)}
 
     def _step_without_autograd(self, view: TrainingView, step: int) -> StepResult | None:
         """Make the step entirely in the backend, on its device. Return None if it cannot."""

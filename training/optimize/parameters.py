@@ -44,8 +44,8 @@ class Parameters:
     sh_interval: int = setting(250, "Steps between increases of the harmonics' degree.", unit="steps")
     sparse_sh: bool = setting(
         True,
-        "Change the harmonics only of splats in the image of a step. Those of others keep their values and "
-        "moments, instead of an Adam step with zero gradients, which takes longer.",
+        "In steps without autograd, change the harmonics only of splats in the image. Those of others keep "
+        "their values and moments, instead of an Adam step with zero gradients, which takes longer.",
     )
     ssim_weight: float = setting(0.2, "Weight of D-SSIM relative to L1 in the loss.", high=1)
     free_depth: float = setting(
