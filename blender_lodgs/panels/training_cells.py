@@ -74,7 +74,10 @@ class LODGS_PT_training_cells(Panel):
     @classmethod
     def poll(cls, context):
         root = roots.active_root(context)
-        return root is not None and bool(root.lodgs.scene_folder) and not viewpoints.has_only_splats(root)
+        if root is None or not root.lodgs.scene_folder or viewpoints.has_only_splats(root):
+            return False
+        watch = watch_of(root)  # while it runs, only a plan has something to show
+        return bool(root.lodgs.training.planned_for) or not (watch and watch.running)
 
     def draw(self, context):
         root = roots.active_root(context)

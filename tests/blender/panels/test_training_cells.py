@@ -109,6 +109,15 @@ def test_settings_that_cannot_be_divided_cause_an_error(root, draw):
     assert any("Choose Points in Start From" in text for text in draw().texts)
 
 
+def test_panel_of_cells_is_not_empty_while_training(bpy, lodgs, root, draw, watch):
+    poll = lodgs("panels.training_cells").LODGS_PT_training_cells.poll
+    assert watch.running and not poll(bpy.context)
+    watch.state = "cancelled"
+    assert poll(bpy.context) and draw().properties
+    watch.state, root.lodgs.training.planned_for = "running", "{}"
+    assert poll(bpy.context) and draw().properties == ["show_cells"]
+
+
 def test_progress_of_each_cell_is_shown(lodgs, root, draw_panel, draw_line, watch):
     def panel():
         return draw_panel("training", "LODGS_PT_training")
