@@ -231,7 +231,8 @@ def _draw_running(layout: bpy.types.UILayout, watch: Watch, root: bpy.types.Obje
     if watch.cancel_requested:
         say(layout, "Cancel again to stop immediately", "INFO")
     elif watch.unresponsive:
-        say(layout, "The trainer is not responding. Cancel it, then resume.", "ERROR")
+        text = "The trainer is not responding. Wait if the computer is busy. Otherwise cancel and resume."
+        say(layout, text, "ERROR")
     draw_cells(layout, root, watch)
     facts = progress_facts(watch.progress)
     if facts:

@@ -193,7 +193,7 @@ def test_progress_while_training(draw, watch):
     }
     assert facts | {"Level 2 of 5 · 35%"} <= set(layout.texts)
     watch.last_event = 0
-    assert any("not responding" in text for text in draw().texts)
+    assert any("not responding. Wait if the computer is busy" in text for text in draw().texts)
     watch.cancel_requested = True
     assert "Cancel again to stop immediately" in draw().texts
 
