@@ -82,6 +82,7 @@ def add_turntable(context: bpy.types.Context, root: bpy.types.Object) -> bpy.typ
     tangent = data.sensor_width / 2 / data.lens * min(1.0, width / height, height / width)
     distance = size / 2 / math.sin(math.atan(tangent))
     data.clip_start, data.clip_end = distance / 1000, 100 * distance
+    data.dof.focus_distance = distance
     pivot.location, pivot.empty_display_size = middle, size / 10
     camera.parent = pivot
     camera.matrix_basis = Matrix.Rotation(math.pi / 2 - ELEVATION, 4, "X") @ Matrix.Translation(

@@ -46,6 +46,7 @@ def test_turntable_circles_the_center_evenly(bpy, lodgs, root):
         np.einsum("ij,ij->i", to_center / distances[:, None], -poses[:, :3, 2]), 1, atol=1e-5
     )
     np.testing.assert_allclose(distances, distances[0], rtol=1e-4)
+    assert bpy.context.scene.camera.data.dof.focus_distance == pytest.approx(distances[0], rel=1e-4)
     assert distances[0] > size / 2 and (poses[:, 1 + 1, 1] > 0.9).all()  # upright
     angles = np.unwrap(np.arctan2(-to_center[:, 1], -to_center[:, 0]))
     np.testing.assert_allclose(np.diff(angles), 2 * np.pi / 48, atol=1e-3)
