@@ -111,18 +111,19 @@ def relative_path(path: str, folder: str = "") -> str:
     return path
 
 
-def scene_paths() -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
-    """Return the paths of this file's scenes as tuples of owner, property name and value."""
+def scene_paths(linked: bool = False) -> Iterator[tuple[bpy.types.bpy_struct, str, str]]:
+    """Return the paths of local or linked scenes as tuples of owner, property name and value."""
     owners: list[bpy.types.bpy_struct] = []
     for obj in bpy.data.objects:
-        if obj.is_editable and obj.lodgs.is_root:
+        if obj.lodgs.is_root:
             owners += [obj.lodgs, obj.lodgs.training, obj.lodgs.stream, obj.lodgs.source]
-        elif obj.is_editable and obj.type == "CAMERA" and obj.data.is_editable:
+        elif obj.type == "CAMERA":
             owners.append(obj.data.lodgs)
     for scene in bpy.data.scenes:
-        if scene.is_editable:
-            owners += [scene.lodgs_render, scene.lodgs_capture]
+        owners += [scene.lodgs_render, scene.lodgs_capture]
     for owner in owners:
+        if (library_of(owner.id_data) is not None) != linked:
+            continue
         for prop in owner.bl_rna.properties:
             is_path = prop.type == "STRING" and prop.subtype in ("FILE_PATH", "DIR_PATH")
             if is_path and (value := getattr(owner, prop.identifier)):
@@ -183,7 +184,7 @@ def _on_saved(*_) -> None:
 
 @bpy.app.handlers.persistent
 def _on_import(context, *_) -> None:
-    """Let the relative paths of appended scenes lead to the same files as in their own .blend file."""
+    """Let the relative paths of appended and linked scenes lead to the files of their own .blend file."""
     folders = {
         item.id: os.path.dirname(bpy.path.abspath(item.source_library.filepath))
         for item in context.import_items
@@ -193,11 +194,21 @@ def _on_import(context, *_) -> None:
         folder = folders.get(owner.id_data)
         if folder and value.startswith("//"):
             setattr(owner, name, stored_path(Path(bpy.path.abspath(value, start=folder))))
+    _resolve_linked()
+
+
+@bpy.app.handlers.persistent
+def _resolve_linked(*_) -> None:
+    """Make the relative paths of linked scenes absolute in memory, so that Make Local keeps them valid."""
+    for owner, name, value in list(scene_paths(linked=True)):
+        if value.startswith("//"):
+            setattr(owner, name, bpy.path.abspath(value, library=library_of(owner.id_data)))
 
 
 def register() -> None:
     if hasattr(bpy.app.handlers, "blend_import_post"):
         bpy.app.handlers.blend_import_post.append(_on_import)
+    bpy.app.handlers.load_post.append(_resolve_linked)
     bpy.app.handlers.save_pre.append(_on_save)
     bpy.app.handlers.save_post.append(_on_saved)
     bpy.app.handlers.save_post_fail.append(_on_saved)
@@ -206,6 +217,7 @@ def register() -> None:
 def unregister() -> None:
     if hasattr(bpy.app.handlers, "blend_import_post"):
         bpy.app.handlers.blend_import_post.remove(_on_import)
+    bpy.app.handlers.load_post.remove(_resolve_linked)
     bpy.app.handlers.save_pre.remove(_on_save)
     bpy.app.handlers.save_post.remove(_on_saved)
     bpy.app.handlers.save_post_fail.remove(_on_saved)

@@ -223,6 +223,29 @@ def test_appended_scenes_keep_their_paths(bpy, lodgs, saved, tmp_path, is_saved)
     assert run.startswith("//") == is_saved and appended.lodgs.training.output == "/elsewhere"
 
 
+@pytest.mark.parametrize("reopened", [False, True])
+def test_scenes_made_local_keep_their_paths(bpy, lodgs, saved, tmp_path, reopened):
+    saved.lodgs.stream.file = "//town.ply"
+    name, collection = saved.name, saved.users_collection[0].name
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "file.blend"))
+    bpy.ops.wm.link(
+        directory=f"{tmp_path}/a/file.blend/Collection/", filename=collection, instance_collections=False
+    )
+    bpy.context.view_layer.update()
+    if reopened:
+        bpy.ops.wm.save_mainfile()
+        bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    bpy.ops.object.select_all(action="SELECT")
+    bpy.ops.object.make_local(type="ALL")
+    root = bpy.data.objects[name]
+    assert root.library is None
+    assert lodgs("data.streams").file_of(root).resolve() == (tmp_path / "a" / "town.ply").resolve()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a" / "other.blend"))
+    assert bpy.data.objects[name].lodgs.stream.file == "//town.ply"
+
+
 @pytest.mark.parametrize("compressed", [False, True])
 def test_truncated_blend_file_is_noticed(bpy, lodgs, tmp_path, compressed):
     """Blender 5.2 saves such a file on a full disk, and reports success."""
