@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import bpy
+import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ..data import cleaning, crops, roots, scenes
+from ..data import cleaning, crops, photographs, roots, scenes
 from ..data.cleanup_tests import HIDE_TESTS, find_matches, limit_properties, limit_property, suggest_limits
 from .base import EditLevelsOperator, SceneOperator, report_errors
 from .brush import TOOLS
@@ -48,16 +51,22 @@ def add_crop(
 ) -> bpy.types.Object:
     """Add a crop around most of a scene's splats and select it.
 
-    Unless it keeps the inside, the crop is a third as large.
+    Its center is that of the subject. Unless it keeps the inside, the crop is at most a third as large, and
+    not larger than the subject.
     """
     if context.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     context.view_layer.update()
     low, high = cleaning.bounds(root)
-    half = (high - low) / (2 if keep == "INSIDE" else 6)
+    subject = photographs.central_bounds(root)
+    assert subject is not None, "bounds refuses scenes without splats and points"
+    middle, diagonal = np.array(subject[0]), subject[1]
+    half = np.maximum(high - middle, middle - low)
+    if keep != "INSIDE":
+        half = np.minimum(half / 3, max(diagonal, 1e-6) / math.sqrt(12))
     if shape == "SPHERE":
         half[:] = half.max()
-    obj = crops.new_crop(root, shape, Matrix.LocRotScale((low + high) / 2, None, half), keep)
+    obj = crops.new_crop(root, shape, Matrix.LocRotScale(middle, None, half), keep)
     for selected in context.selected_objects:
         selected.select_set(False)
     if _make_active(context, obj):

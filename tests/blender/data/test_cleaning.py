@@ -326,6 +326,23 @@ def test_hidden_splats_survive_undo_saving_and_export(bpy, lodgs, scene_of, tmp_
     assert not any(cleaning.HIDDEN in item.object.data.attributes for item in current_root().lodgs.levels)
 
 
+@pytest.mark.parametrize("keep", ["INSIDE", "ALL"])
+def test_crops_are_around_the_subject_in_front_of_a_far_background(bpy, scene_of, keep):
+    rng, bundle = np.random.default_rng(8), bundle_of("bands", np.random.default_rng(5))
+    for level in bundle.levels:
+        means = level.splats.means
+        means[:] = rng.uniform(-1, 1, means.shape) + np.float32((2, 0, 0))
+        means[::4] += np.float32((0, 40, 0))
+    scene_of(bundle)
+    bpy.ops.lodgs.add_crop(shape="BOX", keep=keep)
+    bpy.context.view_layer.update()
+    crop, (rotation, place) = bpy.context.active_object.matrix_world, np.split(ROOT_MATRIX[:3], [3], axis=1)
+    center, half = np.array(crop.translation), np.array(crop.to_scale())
+    np.testing.assert_allclose(center, rotation @ (2, 0, 0) + place[:, 0], atol=0.2 * ROOT_SCALE)
+    share = (np.abs(means @ rotation.T + place[:, 0] - center) <= half).all(axis=1).mean()
+    assert share > 0.7 if keep == "INSIDE" else (half < 1.2 * ROOT_SCALE).all()
+
+
 def test_crops_apply_to_new_levels(bpy, lodgs, scene_of):
     root, _ = scene_of(bundle_of("bands", np.random.default_rng(5)))
     root.lodgs.single_level = 3
