@@ -179,12 +179,15 @@ def main() -> None:
         "--on", nargs="+", default=ON, help="workers to measure; earlier results of others are kept"
     )
     parser.add_argument("--cells", default="3x2")
-    options, train_options = parser.parse_known_args()
+    parser.add_argument(
+        "train", nargs="*", metavar="-- OPTION", help="options of the training, as of lodgs blocks plan"
+    )
+    options = parser.parse_args()
     options.out.parent.mkdir(parents=True, exist_ok=True)
     earlier = json.loads(options.out.read_text(encoding="utf-8"))["rows"] if options.out.exists() else []
     rows = {row["on"]: row for row in earlier}
     for on in options.on:
-        rows[on] = measure(options.work, on, options.cells, train_options)
+        rows[on] = measure(options.work, on, options.cells, options.train)
         report(options.out, sorted(rows.values(), key=lambda row: (row["workers"], row["on"])))
     print(f"{options.out} and {options.out.with_suffix('.png').name}")
 

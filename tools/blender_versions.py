@@ -6,6 +6,7 @@ missing from the list of an older Python.
 
 from __future__ import annotations
 
+import argparse
 import re
 import subprocess
 import sys
@@ -45,6 +46,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     versions = newer(set().union(*map(available, PYTHONS)), pinned())
     print(f"Newer Blender modules than those tested: {', '.join(versions) or 'none'}.")
 

@@ -5,6 +5,7 @@ Needs git, and a Python with pip and the bpy wheel: ``python tools/extension.py`
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import importlib.util
 import re
@@ -106,4 +107,5 @@ def write_repository(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(build(ROOT / "dist"))

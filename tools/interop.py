@@ -1,12 +1,13 @@
 """Check that another program reads our files. Part of ``make interop``.
 
 Passes bundles, a plain PLY and a folder of levels to PlayCanvas' splat-transform (from npm, run on the CPU),
-and compares its counts and rewritten values with ours. ``python tools/interop.py [BUNDLE.ply]`` uses a given
-bundle, or five levels of random splats. Exit code 0: all agree; 1: differences; 2: nothing was checked.
+and compares its counts and rewritten values with ours. Exit code 0: all agree; 1: differences; 2: nothing was
+checked.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -49,14 +50,14 @@ NODE_VERSION = "22.23.3"
 FOLDER = ROOT / "build" / "interop"
 
 
-def main() -> int:
+def main(given: Path | None = None) -> int:
     if problem := node_problem():
         print(f"interop: {problem} Install Node.js {MIN_NODE} or newer with npm (nodejs.org) and repeat.")
         return 2
     if not install():
         print(f"interop: npm cannot install {PACKAGE} {VERSION}, see above.")
         return 2
-    bundle = read_bundle(sys.argv[1]) if len(sys.argv) > 1 else random_bundle()
+    bundle = read_bundle(given) if given else random_bundle()
     if bundle.levels[0].splats.sh_degree > 3:
         print(f"interop: {PACKAGE} only reads spherical harmonics up to degree 3.")
         return 2
@@ -64,7 +65,7 @@ def main() -> int:
     print(f"{'splat-transform ' + VERSION:<50}  {'ours':<34}  {'theirs':<34}")
     for check, expected, actual, same in rows:
         print(f"{check:<50}  {expected!s:<34}  {actual!s:<34}  {'ok' if same else 'DIFFERENT'}")
-    if len(sys.argv) == 1:
+    if given is None:
         store_results(rows)
     return 0 if all(same for *_, same in rows) else 1
 
@@ -274,4 +275,8 @@ def values(path: Path) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "bundle", nargs="?", type=Path, metavar="BUNDLE.ply", help="default: five levels of random splats"
+    )
+    sys.exit(main(parser.parse_args().bundle))

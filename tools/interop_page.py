@@ -2,12 +2,12 @@
 
 Writes the levels of FLoD, as ``interop_viewers.py`` trains them, as one file and as a folder, and opens the
 file from disk and the folder from a server, without a graphics card.
-``python tools/interop_page.py BUNDLE.ply`` uses a given bundle, without a record.
 Exit code 0: all checks pass; 1: some do not; 2: nothing was checked.
 """
 
 from __future__ import annotations
 
+import argparse
 import functools
 import http.server
 import io
@@ -46,12 +46,16 @@ EXPECTED = r"SuperSplat Viewer v.*|Renderer: \w+|No available adapters\."
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "bundle", nargs="?", type=Path, metavar="BUNDLE.ply", help="use this bundle, without a record"
+    )
+    given = parser.parse_args().bundle
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         print("interop: Chromium is not installed. Pages are not checked.")
         return 2
-    given = list(map(Path, sys.argv[1:]))
-    source = given[0] if given else train_method(WALKED)
+    source = given or train_method(WALKED)
     failed = False
     with tempfile.TemporaryDirectory() as work:
         folder, single = Path(work, "page"), Path(work, "page.html")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import importlib
 import json
@@ -96,6 +97,9 @@ def _add_levels(bpy) -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", nargs="?", type=Path, default=DIGESTS, help="file to write")
+    out = parser.parse_args().out
     text = json.dumps(panel_digests(start_blender()), indent=1) + "\n"
-    Path(sys.argv[1] if sys.argv[1:] else DIGESTS).write_text(text, encoding="utf-8")
+    out.write_text(text, encoding="utf-8")
     os._exit(0)  # Blender as a module can hang when Python ends

@@ -1,10 +1,8 @@
-"""Plot the levels of the table in docs/development/measurements.md.
-
-.venv/bin/python tools/plot_measurements.py
-"""
+"""Plot the levels of the table in docs/development/measurements.md."""
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import matplotlib as mpl
@@ -30,6 +28,7 @@ def read_levels(text: str) -> dict[str, list[float]]:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
     labels = []
     for scene, values in read_levels(PAGE.read_text(encoding="utf-8")).items():

@@ -6,6 +6,7 @@ the unchanged photos. All randomness is fixed.
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -206,21 +207,24 @@ def write_courtyard(out: Path, splats: int = 1_000_000, photos: int = 36, scale:
     return out
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Write one copy: SCENE COPY KIND [factor on changes of light]."""
+def main() -> int:
+    """Write one copy."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path, metavar="SCENE")
+    parser.add_argument("copy", type=Path, metavar="COPY", help="folder to write")
+    parser.add_argument("kind", choices=list(SUBSETS))
+    parser.add_argument("factor", nargs="?", type=float, default=1.0, help="factor on changes of light")
+    options = parser.parse_args()
+    subset = SUBSETS[options.kind]
     try:
-        folder, out, kind, *stops = arguments
-        copy = write_subset(Path(folder), Path(out), SUBSETS[kind], *map(float, stops))
-    except (ValueError, KeyError):
-        print(f"Usage: tools/quality_scenes.py SCENE COPY {{{','.join(SUBSETS)}}} [FACTOR]", file=sys.stderr)
-        return 2
+        copy = write_subset(options.scene, options.copy, subset, options.factor)
     except LodgsError as error:
         print(error.what, error.remedy, file=sys.stderr)
         return 2
     if copy is None:
-        print(f"The scene has fewer than {SUBSETS[kind].min_photos} photos.", file=sys.stderr)
+        print(f"The scene has fewer than {subset.min_photos} photos.", file=sys.stderr)
     return 0 if copy else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

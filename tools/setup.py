@@ -8,6 +8,7 @@ python3 tools/setup.py 5.2        .venv-blender-5.2 (Blender 5.2, Python 3.13)
 
 from __future__ import annotations
 
+import argparse
 import ctypes.util
 import hashlib
 import os
@@ -138,6 +139,11 @@ def find_uv(pip: list[str]) -> str | None:
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("blender", nargs="?", choices=["5.0", "5.2"], help="only this Blender")
+    blender = parser.parse_args().blender
     python = find_python("3.11")
     if python is None:
         print(
@@ -145,11 +151,11 @@ def main() -> int:
         )
         return 1
     try:
-        if sys.argv[1:] == ["5.0"]:
+        if blender == "5.0":
             make(".venv-blender-5.0", python, "blender-5.0.txt")
             return 0
         newer = find_python("3.13")
-        if sys.argv[1:] == ["5.2"]:
+        if blender == "5.2":
             if newer is None:
                 print("setup: Blender 5.2 needs Python 3.13; install it.", file=sys.stderr)
                 return 1

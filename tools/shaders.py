@@ -7,6 +7,7 @@ shaders are translated; 1: errors; 2: nothing was checked.
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -57,6 +58,7 @@ def translate() -> dict:
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     if problem := node_problem():
         print(f"shaders: {problem} Install Node.js with npm and repeat.")
         return 2

@@ -6,6 +6,7 @@ has a public interface for cameras and budgets. Releases contain it.
 
 from __future__ import annotations
 
+import argparse
 import base64
 import hashlib
 import io
@@ -50,4 +51,5 @@ def fetch() -> bool:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     sys.exit(not fetch())

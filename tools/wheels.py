@@ -1,13 +1,12 @@
 """Check on the package index that a lock file can be installed from wheels only on all platforms.
 
-tools/wheels.py [requirements/trainer.txt]
-
 Uses pip's resolver (``--dry-run --platform``) with the lock's hashes. pip evaluates markers for the current
 platform, so this script filters lines by marker first. Takes minutes and installs nothing.
 """
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -62,7 +61,9 @@ def missing(lines: list[str], system: str, python: str) -> str:
 
 
 def main() -> int:
-    lock = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "requirements" / "trainer.txt"
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("lock", nargs="?", type=Path, default=ROOT / "requirements" / "trainer.txt")
+    lock = parser.parse_args().lock
     failed = False
     for system in SYSTEMS:
         for python in PYTHONS:

@@ -39,7 +39,7 @@ def test_plan_is_measured_and_plotted(tiny_scene, tmp_path, monkeypatch):
     out = tmp_path / "blocks.json"
     options = "--method 3dgs --set steps=20 --set max_splats=200 --polish 0 --image-scale 1 --test-every 4"
     paths = ["--on", "here", "--cells", "1x1", "--out", str(out), "--work", str(tmp_path / "work")]
-    monkeypatch.setattr(sys, "argv", ["bench", *paths, "--scene", str(tiny_scene), *options.split()])
+    monkeypatch.setattr(sys, "argv", ["bench", *paths, "--", "--scene", str(tiny_scene), *options.split()])
     bench_blocks.main()
     saved = json.loads(out.read_text())
     (row,) = saved["rows"]
