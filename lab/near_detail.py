@@ -1,21 +1,25 @@
 """Measure the detail of levels made from splats, near their surface.
 
 Compares renders of the selected levels with the finest level at 0.25, 0.5 and 1 times the scene's size from
-its surface, from close views that training did not see: ``python -m lab.near_detail BUNDLE``. Prints the
+its surface, from close views that training did not see: ``python lab/near_detail.py BUNDLE``. Prints the
 mean and the lowest PSNR, and the share of splats drawn.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from training.api import load_bundle, render_image, select
-from training.evaluate.metrics import psnr
-from training.scenes.viewpoints import CLOSE, close_views, opaque_means
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from training.api import load_bundle, render_image, select  # noqa: E402
+from training.evaluate.metrics import psnr  # noqa: E402
+from training.scenes.viewpoints import CLOSE, close_views, opaque_means  # noqa: E402
 
 SEEN = 64
 """Number of close views that training may have seen: the first ones."""

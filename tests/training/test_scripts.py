@@ -18,6 +18,9 @@ SCRIPTS = [
 @pytest.mark.parametrize(("option", "code"), [("--help", 0), ("--no-such-option", 2)])
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_scripts_explain_themselves_and_reject_unknown_options(script, option, code):
-    result = subprocess.run([sys.executable, ROOT / script, option], cwd=ROOT, capture_output=True, text=True)
+    path = Path(script)
+    program = ["-m", f"examples.{path.stem}"] if path.parent.name == "examples" else [script]
+    command = [sys.executable, *program, option]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == code, result.stderr
-    assert (result.stderr if code else result.stdout).startswith(f"usage: {Path(script).name}")
+    assert (result.stderr if code else result.stdout).startswith(f"usage: {path.name}")
