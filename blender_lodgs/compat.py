@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 import bpy
+import numpy as np
 
 WIDE_TYPE = (
     "FLOAT4" if "FLOAT4" in bpy.types.Attribute.bl_rna.properties["data_type"].enum_items else "FLOAT_COLOR"
@@ -54,16 +55,29 @@ def is_native(cloud: bpy.types.PointCloud) -> bool:
     return NATIVE_SPLATS is not None and getattr(cloud, NATIVE_SPLATS[0]) == NATIVE_SPLATS[1]
 
 
-def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
-    """Create a point-cloud datablock of ``count`` points at the origin, without users."""
+def new_point_cloud(name: str, positions: np.ndarray) -> bpy.types.PointCloud:
+    """Create a point-cloud datablock of points at the positions (N, 3), without users."""
+    coordinates = np.ascontiguousarray(positions, np.float32).ravel()
     cloud = bpy.data.pointclouds.new(name)
     if hasattr(cloud, "resize"):
-        cloud.resize(count)
-        return cloud
-    # Without PointCloud.resize, only a conversion creates points. A separate scene keeps mode and selection.
-    bpy.data.pointclouds.remove(cloud)
+        cloud.resize(len(positions))
+    else:
+        bpy.data.pointclouds.remove(cloud)
+        cloud = _converted_vertices(name, coordinates)
+    position = cloud.attributes.get("position") or cloud.attributes.new("position", "FLOAT_VECTOR", "POINT")
+    position.data.foreach_set("vector", coordinates)
+    return cloud
+
+
+def _converted_vertices(name: str, coordinates: np.ndarray) -> bpy.types.PointCloud:
+    """Create a point cloud from vertices; the only way without PointCloud.resize.
+
+    The vertices have their coordinates (3N,) before, since Blender 5.0 keeps the bounds of the conversion. A
+    separate scene keeps mode and selection.
+    """
     mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(count)
+    mesh.vertices.add(len(coordinates) // 3)
+    mesh.vertices.foreach_set("co", coordinates)
     carrier, scene = bpy.data.objects.new(name, mesh), bpy.data.scenes.new(name)
     scene.collection.objects.link(carrier)
     with bpy.context.temp_override(

@@ -76,8 +76,7 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
         colors: (P, 3) uint8, sRGB.
         radius: display radius in the object's units.
     """
-    cloud = compat.new_point_cloud(name, len(positions))
-    write_attribute(cloud, "position", "FLOAT_VECTOR", positions)
+    cloud = compat.new_point_cloud(name, positions)
     write_attribute(cloud, RADIUS, "FLOAT", np.full(len(positions), radius))
     cloud.materials.append(display.points_material())
     obj = bpy.data.objects.new(name, cloud)
@@ -88,10 +87,9 @@ def new_points(name: str, positions: np.ndarray, colors: np.ndarray, radius: flo
 @all_or_nothing()
 def new_splats(name: str, splats: Splats) -> bpy.types.Object:
     """Create an object of splats, not yet in a collection; its local space is the splats' world."""
-    cloud = compat.new_point_cloud(name, len(splats))
+    cloud = compat.new_point_cloud(name, splats.means)
     base = np.empty((len(splats), 4), np.float32)
     base[:, :3], base[:, 3] = splats.sh[:, 0], _sigmoid(splats.opacity_logits)
-    write_attribute(cloud, "position", "FLOAT_VECTOR", splats.means)
     write_attribute(cloud, BASE, compat.WIDE_TYPE, base)
     del base  # frees memory before further attributes need it
     write_attribute(cloud, SCALE, "FLOAT_VECTOR", _exp(splats.log_scales))

@@ -172,12 +172,8 @@ def test_no_timer_remains_without_the_extension(bpy, lodgs):
 
 @pytest.mark.parametrize("operator", ["add_crop", "find_clutter", "tint_by_light"])
 def test_levels_without_splats_are_reported(bpy, lodgs, root, operator):
-    cloud = lodgs("compat").new_point_cloud("empty", 0)
-    for name, kind in (
-        ("position", "FLOAT_VECTOR"),
-        ("scale", "FLOAT_VECTOR"),
-        ("radiance:base", "FLOAT_COLOR"),
-    ):
+    cloud = lodgs("compat").new_point_cloud("empty", np.zeros((0, 3)))
+    for name, kind in (("scale", "FLOAT_VECTOR"), ("radiance:base", "FLOAT_COLOR")):
         lodgs("attributes").write_attribute(cloud, name, kind, np.zeros((0, 1)))
     root.lodgs.levels[-1].object.data = cloud
     with pytest.raises(RuntimeError, match=r"^Error: Cannot (measure|find clutter)"):

@@ -39,9 +39,8 @@ def native(bpy, lodgs):
 
     def make_object(splats, first=0, name="cloud"):
         attributes, compat = lodgs("attributes"), lodgs("compat")
-        cloud = compat.new_point_cloud(name, len(splats))
+        cloud = compat.new_point_cloud(name, splats.means)
         base = np.column_stack([splats.sh[:, 0], 1 / (1 + np.exp(-splats.opacity_logits))])
-        attributes.write_attribute(cloud, "position", "FLOAT_VECTOR", splats.means)
         attributes.write_attribute(cloud, "radiance:base", compat.WIDE_TYPE, base)
         attributes.write_attribute(cloud, "scale", "FLOAT_VECTOR", np.exp(splats.log_scales))
         unit = splats.quats / np.linalg.norm(splats.quats, axis=1, keepdims=True)

@@ -54,6 +54,17 @@ def test_round_trip_is_bit_exact(lodgs, make, degree):
     assert same_bits(splats, objects.read_splats(obj))
 
 
+def test_bounds_are_those_of_the_points(bpy, lodgs, make):
+    splats = make(50)
+    points = lodgs("data.objects").new_points("points", splats.means, np.zeros((50, 3), np.uint8), 0.0)
+    for obj in (points, lodgs("data.objects").new_splats("splats", splats)):
+        bpy.context.scene.collection.objects.link(obj)
+        bpy.context.view_layer.update()
+        center = np.mean(obj.bound_box, axis=0)
+        expected = (splats.means.min(axis=0) + splats.means.max(axis=0)) / 2
+        np.testing.assert_allclose(center, expected, atol=0.2)  # splats have a radius
+
+
 def test_round_trip_of_no_splats_and_of_one(lodgs, make):
     objects = lodgs("data.objects")
     for count in (0, 1):
