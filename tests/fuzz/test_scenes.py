@@ -15,6 +15,7 @@ from tests.fuzz.mutations import corrupted, corrupted_value
 from tests.training.scenes import synthetic
 from training.scenes.cameras import MAX_COORDINATE, Camera, camera_to_dict, read_camera
 from training.scenes.colmap import read_scene
+from training.scenes.observations import observed_pixels
 from training.splats.georeference import ECEF, FILE, Georeference, read_georeference
 
 CAMERA = camera_to_dict(Camera("a.png", 96, 72, 80.0, 82.0, 47.0, 37.0, np.eye(4)), 0.1)
@@ -59,6 +60,8 @@ def check(scene, model, content: object) -> None:
         assert np.isfinite(result.extent(default=1.0) if len(result.points) else result.center).all()
         assert np.isfinite(result.up_rotation()).all()
         assert "".join(result.warnings).encode() is not None  # printable
+        names = [camera.name for camera in result.cameras]
+        attempt("COLMAP observations", lambda: observed_pixels(result, names), content)
 
 
 @pytest.mark.cases(short=150, weight=3)

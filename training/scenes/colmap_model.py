@@ -157,7 +157,7 @@ def _read(model: Path, name: str, parsers: dict, suffix: str = "") -> Any:
             return parsers[suffix](mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:
         raise LodgsError(f"Cannot read {path}: {error.strerror}.", "Check the folder.") from error
-    except (ValueError, IndexError, KeyError, struct.error) as error:
+    except (ValueError, IndexError, KeyError, OverflowError, struct.error) as error:
         raise _model_error(path, error) from error
 
 

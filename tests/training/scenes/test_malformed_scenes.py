@@ -87,6 +87,13 @@ def test_names_that_leave_the_folder_on_any_system(scene, name):
     assert observations(result, ["a.png"])["a.png"].tolist() == [2]
 
 
+def test_point_ids_beyond_64_bits(scene):
+    write_text_model(scene / "sparse", "1 1 0 0 0 0 0 0 1 a.png\n5 5 2 6 6 99999999999999999999\n", grid())
+    result = read_scene(scene)
+    with pytest.raises(LodgsError, match="images.txt: the file is damaged"):
+        observations(result, ["a.png"])
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows reserves the colon for drives")
 def test_names_with_a_colon(scene):
     """A letter before a colon is no drive without a slash."""
