@@ -170,11 +170,7 @@ def thin_outside_region(scene: Scene, region: Crop, limit: int) -> Scene:
         points = scene.points[outside]
         distances = np.linalg.norm(points - scene.center, axis=1)
         outside = outside[thin_evenly(points, distances, limit, np.random.default_rng(0))]
-    rows = np.sort(np.concatenate([np.flatnonzero(inside), outside]))
-    return replace(
-        scene, points=scene.points[rows], point_colors=scene.point_colors[rows],
-        point_ids=scene.point_ids[rows] if len(scene.point_ids) else scene.point_ids,
-    )  # fmt: skip
+    return scene.select_points(np.sort(np.concatenate([np.flatnonzero(inside), outside])))
 
 
 def _scene_folder(job: Job, folder: RunFolder, report: Callable[..., None]) -> Path:

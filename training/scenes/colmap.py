@@ -102,6 +102,14 @@ class Scene:
         train = [camera for camera in self.cameras if phase[camera.name] not in (0, middle)]
         return train, [camera for camera in self.cameras if phase[camera.name] == middle]
 
+    def select_points(self, index: np.ndarray) -> Scene:
+        """Return the scene with only some of its points, given by a mask (P,) or indices."""
+        ids = self.point_ids
+        return replace(
+            self, points=self.points[index], point_colors=self.point_colors[index],
+            point_ids=ids[index] if len(ids) else ids,
+        )  # fmt: skip
+
     @property
     def center(self) -> np.ndarray:
         """Mean camera position, (3,) float64."""

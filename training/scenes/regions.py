@@ -69,9 +69,8 @@ class Region:
         return self.in_enlarged_cell(scene.points) | observed_points(scene, frozenset(self.views))
 
     def select_points(self, scene: Scene, full_scene: Scene) -> Scene:
-        """Return a scene with the initial points of the region, from the full scene."""
-        inside = self.start_points(full_scene)
-        return replace(scene, points=full_scene.points[inside], point_colors=full_scene.point_colors[inside])
+        """Return a scene, which has the points of the full scene, with the initial points of the region."""
+        return scene.select_points(self.start_points(full_scene))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return a mask (P,) of the points (P, 3) in the cell. The cells of a plan do not overlap."""

@@ -90,7 +90,7 @@ def test_names_that_leave_the_folder_on_any_system(scene, name):
 def test_point_ids_beyond_64_bits(scene):
     write_text_model(scene / "sparse", "1 1 0 0 0 0 0 0 1 a.png\n5 5 2 6 6 99999999999999999999\n", grid())
     result = read_scene(scene)
-    with pytest.raises(LodgsError, match="images.txt: the file is damaged"):
+    with pytest.raises(LodgsError, match=r"images\.txt: the file is damaged"):
         observations(result, ["a.png"])
 
 

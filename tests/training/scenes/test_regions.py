@@ -148,6 +148,18 @@ def test_observed_points_match_pycolmap(tmp_path, text):
     assert pycolmap.__version__
 
 
+def test_points_of_a_region_keep_their_observations(tmp_path):
+    """The views of a region observe the same positions as in the full scene."""
+    write_scene(tmp_path)
+    full = read_scene(tmp_path)
+    region = Region(np.eye(3), np.zeros((2, 2)), np.zeros((2, 2)), ("b.png", "c.png"))
+    scene = region.select_points(region.select_views(full), full)
+    assert 0 < len(scene.points) < len(full.points)
+    for name in region.views:
+        observed, expected = (s.points[observed_points(s, [name])].tolist() for s in (scene, full))
+        assert observed == expected and observed
+
+
 def test_points_in_the_image_count_as_observed_without_tracks(grid):
     observed = observed_points(grid, ["00"])
     np.testing.assert_array_equal(observed, grid.cameras[0].sees(grid.points))
