@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import KDTree
 
 from ..errors import LodgsError
+from ..lod.crop import Crop
 from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene
 from ..splats.gaussians import SH_C0, Splats
@@ -59,7 +60,12 @@ def sample_points(
 
 
 def initial_points(
-    scene: Scene, cameras: Sequence[Camera], between: float, limit: int, seed: int
+    scene: Scene,
+    cameras: Sequence[Camera],
+    between: float,
+    limit: int,
+    seed: int,
+    region: Crop | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the points to start from: the scene's, without repetitions, and others between them.
 
@@ -69,6 +75,7 @@ def initial_points(
         between: maximum number of points between the scene's points, as a multiple of their number.
         limit: maximum number of points; if the scene has more, they are a random sample.
         seed: seed of random choices.
+        region: region in scene coordinates of the points between others; None for everywhere.
 
     Returns:
         Points (N, 3) in scene coordinates and display-coded colours (N, 3) uint8.
@@ -79,7 +86,7 @@ def initial_points(
     points, colors = drop_duplicates(scene.points, scene.point_colors)
     room = round(MAX_START * limit) - len(points)
     count = min(round(between * len(points)), room)
-    added, added_colors = points_between(scene, cameras, count, seed)
+    added, added_colors = points_between(scene, cameras, count, seed, region)
     points, colors = np.concatenate([points, added]), np.concatenate([colors, added_colors])
     return sample_points(points, colors, limit, seed)
 

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
+from ..lod.crop import Crop
 from ..scenes.cameras import Camera
 from ..scenes.colmap import Scene
+from ..scenes.images import load_mask
 from ..scenes.observations import observed_pixels
 from .neighbors import query_neighbors
 
@@ -57,9 +59,14 @@ class PhotoParts(NamedTuple):
     def interpolate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Interpolate inverse depth in parts without points whose nearest points have similar depths.
 
+        Parts that the photo's mask ignores at their middle are left out.
+
         Returns:
             Points (M, 3) in scene coordinates at the middles of these parts; indices (M, S) of their S =
             ``SURFACE_POINTS`` nearest scene points; and the weights (M, S) of these in the interpolation.
+
+        Raises:
+            LodgsError: the mask cannot be read.
         """
         distances, depths = self.distances[:, :SURFACE_POINTS], self.depths[:, :SURFACE_POINTS]
         between = (
@@ -67,6 +74,9 @@ class PhotoParts(NamedTuple):
             & (distances[:, -1] <= MAX_DISTANCE * self.camera.width)
             & (depths.max(1) <= SIMILAR_DEPTHS * depths.min(1))
         )
+        if self.camera.mask is not None:
+            column, row = self.middles.astype(np.int64).T
+            between &= load_mask(self.camera.mask, self.camera.width, self.camera.height)[row, column] >= 0.5
         weights = 1 / distances[between]
         weights /= weights.sum(1, keepdims=True)
         positions = self.camera.unproject(self.middles[between], 1 / (weights / depths[between]).sum(1))
@@ -99,7 +109,7 @@ def photo_parts(scene: Scene, cameras: Sequence[Camera]) -> Iterator[PhotoParts]
 
 
 def points_between(
-    scene: Scene, cameras: Sequence[Camera], limit: int, seed: int
+    scene: Scene, cameras: Sequence[Camera], limit: int, seed: int, region: Crop | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate points between the scene's points, at random parts of photos; see
     :meth:`PhotoParts.interpolate`.
@@ -108,6 +118,7 @@ def points_between(
         scene, cameras: see :func:`photo_parts`.
         limit: maximum number of points; all photos have the same share.
         seed: seed of the choice.
+        region: region in scene coordinates that contains the points; None for everywhere.
 
     Returns:
         Points (M, 3) float32 and their interpolated colours (M, 3) uint8.
@@ -117,7 +128,8 @@ def points_between(
     share = limit // len(cameras)
     for parts in photo_parts(scene, cameras) if share > 0 else ():
         points, nearest, weights = parts.interpolate()
-        chosen = rng.permutation(len(points))[:share]
+        inside = np.arange(len(points)) if region is None else np.flatnonzero(region.contains(points))
+        chosen = rng.permutation(inside)[:share]
         mixed = np.einsum("ms,msc->mc", weights[chosen], scene.point_colors[nearest[chosen]].astype(float))
         positions.append(points[chosen].astype(np.float32))
         colors.append(np.rint(mixed).astype(np.uint8))

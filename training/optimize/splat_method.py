@@ -43,7 +43,9 @@ class SplatMethod(Method[SplatParameters, Drawing]):
             tensors = from_splats(base, p.sh_degree, self.device)
         else:
             limit = p.growth_limit(p.splat_limit)
-            points, colors = initial_points(data.scene, data.train, p.points_between, limit, self.seed)
+            points, colors = initial_points(
+                data.scene, data.train, p.points_between, limit, self.seed, data.region
+            )
             tensors = from_points(points, colors, p.sh_degree, self.device)
         self.model = self.new_model(tensors)
         self._densify_until = p.densify_until * self.scheduled_steps

@@ -1,11 +1,14 @@
 """Depths of parts of photos, in scenes of planes whose depths are known."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from training.lod.crop import Crop
 from training.optimize import observed_depths
 from training.optimize.initialize import initial_points
 from training.optimize.model import Model
@@ -77,6 +80,28 @@ def test_colors_are_mixed_from_those_around():
     scene.point_colors = np.where(points[:, :1] < 0, GRAY, RED).astype(np.uint8)
     added, colors = points_between(scene, [camera()], 100_000, 0)
     assert (colors[added[:, 0] < -1] == GRAY).all() and (colors[added[:, 0] > 1] == RED).all()
+
+
+def test_no_points_where_the_mask_ignores_the_photo(tmp_path):
+    """Nothing would train or remove them: the background of an object, which no photo shows."""
+    mask = np.zeros((64, 64), np.uint8)
+    mask[:, 32:] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    masked = replace(camera(), mask=tmp_path / "mask.png")
+    scene = scene_of(plane(spacing=1))
+    added, _ = points_between(scene, [masked], 100_000, 0)
+    everywhere, _ = points_between(scene, [camera()], 100_000, 0)
+    right = {tuple(point) for point in everywhere[everywhere[:, 0] > 0]}
+    assert len(right) > 100 and {tuple(point) for point in added} == right
+
+
+def test_points_between_are_inside_the_region_of_the_job():
+    """The rest is trained coarsely, so that photos spend their share of the limit on the region."""
+    points, region = plane(spacing=1), Crop.sphere((WALL / 2, 0, WALL), 3)
+    scene = scene_of(points)
+    added = initial_points(scene, [camera()], 1.0, 5000, 0, region)[0][len(points) :]
+    everywhere, _ = points_between(scene, [camera()], 100_000, 0)
+    assert len(added) == region.contains(everywhere).sum() > 100 and region.contains(added).all()
 
 
 def test_photos_share_the_limit_evenly():

@@ -67,7 +67,9 @@ class Method(method.Method[FlodParameters, Drawing]):
         self.stages = LevelStages(p.stages)
         self.merged = MergedLevels(self.stages, data, p, self.seed, self.backend)
         limit = p.growth_limit(p.splat_limit)
-        self.points, self.colors = initial_points(data.scene, data.train, p.points_between, limit, self.seed)
+        self.points, self.colors = initial_points(
+            data.scene, data.train, p.points_between, limit, self.seed, data.region
+        )
         self.completed: dict[int, Mapping[str, torch.Tensor]] = {}
         self.levels = p.levels
         if p.levels > 1:
