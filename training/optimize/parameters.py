@@ -228,7 +228,8 @@ class DensityParameters(FarViewParameters):
     opacity_decay: float = setting(
         0.1,
         "Fraction by which opacities fall at each removal of transparent splats, so that splats without "
-        "support in several photos disappear. It decreases to 0 at 40 photos. 0 disables.",
+        "support in several photos disappear. It decreases to 0 at 40 photos. 3DGS from a base does not "
+        "use it. 0 disables.",
         high=0.9,
     )
     opacity_reset_interval: int = setting(0, "Steps between opacity resets. 0 disables.", unit="steps")

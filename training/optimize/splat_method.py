@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -39,6 +40,7 @@ class SplatMethod(Method[SplatParameters, Drawing]):
     def setup(self, base: Splats | None) -> None:
         p, data = self.parameters, self.data
         if base is not None:
+            self.parameters = p = replace(p, opacity_decay=0.0)  # parts that no photo sees would disappear
             self.sh_degree.full_from = 0
             tensors = from_splats(base, p.sh_degree, self.device)
         else:

@@ -150,6 +150,14 @@ def test_opacities_fall_while_splats_are_added(data, name, levels):
         torch.testing.assert_close(method.model.read("opacity_logits").sigmoid(), expected)
 
 
+def test_opacities_of_a_base_stay(data):
+    """Photos that show only a part of it must not remove the rest."""
+    base = make(data, steps=20).model.splats()
+    method = create("3dgs", data, method_info("3dgs").preset("draft"), seed=0, backend="cpu", base=base)
+    method.control_density(99)
+    assert method.model.splats().opacity_logits.tolist() == base.opacity_logits.tolist()
+
+
 @pytest.mark.parametrize("name", ["3dgs", "flod"])
 def test_training_starts_with_splats_between_points(data, name, monkeypatch):
     between = np.array([[0.25] * 3, [0.5] * 3, [0.75] * 3], np.float32)
