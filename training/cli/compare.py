@@ -51,7 +51,6 @@ def run(options: argparse.Namespace) -> int:
     from ..runs.comparison.results import format_results
     from ..runs.folder import RunFolder
 
-    create_folder(options.out)
     is_run = [RunFolder(source).job.is_file() for source in options.sources]
     if any(is_run) and not all(is_run):
         wrong = next(source for source, known in zip(options.sources, is_run, strict=True) if not known)
@@ -62,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
     weights = lpips_archive(options)
     reports = []
     scenes = [None] if all(is_run) else _scene_folders(options)
+    create_folder(options.out)
     for scene in scenes:
         out = options.out if len(scenes) == 1 or scene is None else options.out / scene.resolve().name
         runs = options.sources if scene is None else _train_methods(options, scene, out)

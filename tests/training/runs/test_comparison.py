@@ -369,6 +369,7 @@ def test_scene_and_run_together_are_refused(tiny_scene, runs, tmp_path, capsys):
 def test_missing_scene_and_unwritable_folder_are_named_before_any_work(runs, tmp_path, capsys):
     assert main(["compare", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
     assert f"Cannot open {tmp_path / 'none'}: the folder does not exist." in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
     (tmp_path / "file").touch()
     assert main(["compare", str(runs[0]), "--out", str(tmp_path / "file" / "out")]) == 2
     assert f"Cannot write to {tmp_path / 'file' / 'out'}: " in capsys.readouterr().err
