@@ -23,7 +23,7 @@ from .errors import LodgsError, is_system_problem, missing_clause, printable, re
 
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\xb9\xb2\xb3])\s*([.:].*)?", re.I)
 
-_CLUTTER = {".DS_Store", "Thumbs.db", "desktop.ini"}
+CLUTTER = {".DS_Store", "Thumbs.db", "desktop.ini"}
 """Files that macOS and Windows add to folders."""
 
 
@@ -297,7 +297,7 @@ def check_export_folder(folder: Path, main: str, others: str) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise LodgsError(f"Cannot export to {folder}: it is not a folder.", "Choose an empty folder.")
-    names = {path.name for path in folder.iterdir()} - _CLUTTER if folder.is_dir() else set()
+    names = {path.name for path in folder.iterdir()} - CLUTTER if folder.is_dir() else set()
     if names and not (main in names and all(re.fullmatch(others, name) for name in names - {main})):
         raise LodgsError(f"Cannot export to {folder}: it contains other files.", "Choose an empty folder.")
 

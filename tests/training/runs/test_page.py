@@ -81,6 +81,7 @@ def test_folder_has_levels_viewer_and_cameras(bundle, tmp_path):
     np.testing.assert_allclose(forward / np.linalg.norm(forward), [0, 0, 1], atol=1e-6)
     assert pose["fov"] == pytest.approx(degrees(2 * atan(16 / 9 * 24 / 60)))
     assert page["settings"]["annotations"][0]["title"] == "<first>.jpg" and "<first>" not in text
+    (tmp_path / "out" / ".DS_Store").touch()  # of macOS, once the folder was viewed
     write_page(bundle, tmp_path / "out", backend="cpu")  # replaces the page
     assert {path.name for path in tmp_path.iterdir()} == {"garden", "out", "viewer"}
 

@@ -18,7 +18,7 @@ from ...editing.edit import open_levels
 from ...editing.placement import transform_bundle, upright_placement
 from ...editing.portable import portable_levels
 from ...errors import LodgsError, printable
-from ...files import atomic_folder, atomic_write, check_name, temporary_folder
+from ...files import CLUTTER, atomic_folder, atomic_write, check_name, temporary_folder
 from ...rasterize.resident import ResidentBundle
 from ...scenes.cameras import Camera, pick_evenly
 from ...scenes.images import write_png
@@ -111,7 +111,7 @@ def _check_place(out: Path, single: bool) -> None:
         return
     if out.exists() and not out.is_dir():
         raise LodgsError(f"Cannot write a page to {out}: it is not a folder.", "Choose an empty folder.")
-    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    names = {path.name for path in out.iterdir()} - CLUTTER if out.is_dir() else set()
     if names and not ({PAGE, LEVELS} <= names <= {PAGE, LEVELS, VIEWER.name, POSTER}):
         raise LodgsError(f"Cannot write a page to {out}: it contains other files.", "Choose an empty folder.")
 
