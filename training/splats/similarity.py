@@ -19,6 +19,7 @@ _DIRECTIONS = 200
 """Number of directions that determine the rotation of harmonics; degree 4 needs at least 9."""
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # too large or small numbers are refused
 def is_similarity(matrix: np.ndarray) -> bool:
     """Return True if a transform (4, 4) is a rotation, one scale for all axes, and a translation."""
     linear = matrix[:3, :3]

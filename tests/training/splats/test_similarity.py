@@ -141,6 +141,7 @@ def test_angles_match_scipy_about_fixed_axes():
     )
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     "linear",
     [
@@ -149,6 +150,7 @@ def test_angles_match_scipy_about_fixed_axes():
         np.array([[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
         np.zeros((3, 3)),
         np.diag([np.nan, 1, 1]),
+        np.diag([1e300, 1e300, 1e300]),
     ],
 )
 def test_other_transforms_are_refused(linear):
