@@ -13,6 +13,7 @@ from threading import Event
 import bpy
 from mathutils import Matrix
 
+from ...training.errors import LodgsError
 from ...training.lod.on_disk import open_paged
 from ...training.lod.rule import resolve_rule
 from ...training.lod.selection import unknown_rule_error
@@ -259,6 +260,8 @@ def read_splats_file(path: Path | str, budget: int = 0, convert: Convert | None 
         if not bundle.method and not bundle.on_disk:  # another program's file
             overview.complete_meta(bundle)
             warnings += overview.describe_clutter(bundle.levels[-1].splats)
+    if not any(len(level.rows) for level in bundle.levels):
+        raise LodgsError(f"Cannot import {path}: it has no splats that can be drawn.", "Export it again.")
     return SplatsFile(path, bundle, total, budget, warnings, stamp)
 
 

@@ -42,6 +42,16 @@ def only_root(bpy):
     return root
 
 
+@pytest.mark.parametrize("count", [0, 9])
+def test_file_without_splats_to_draw_is_refused(bpy, lodgs, bundle, tmp_path, count):
+    splats = bundle.levels[0].splats.select(slice(0, count))
+    splats.means[:] = np.nan
+    lodgs("training.splats.ply").write_ply(tmp_path / "nan.ply", splats)
+    with pytest.raises(RuntimeError, match=r"nan\.ply: it has no splats that can be drawn"):
+        bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "nan.ply"))
+    assert not bpy.data.objects and not bpy.data.collections
+
+
 def test_bundle_round_trip_is_identical(bpy, bundle, file, tmp_path):
     assert bpy.ops.lodgs.import_splats(filepath=str(file)) == {"FINISHED"}
     settings = only_root(bpy).lodgs
