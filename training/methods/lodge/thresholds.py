@@ -104,7 +104,8 @@ class Thresholds:
         for camera in self._cameras:
             means = finest.means[finest.in_view(camera, self._near)]
             visible.append(np.linalg.norm(means[camera.sees(means, self._near)] - camera.center, axis=1))
-        visible = [distances for distances in visible if len(distances)] or [np.array([min_distance])]
+        visible = [distances for distances in visible if len(distances)]
+        visible = visible or [np.linalg.norm(finest.means - c.center, axis=1) for c in self._cameras]
         nearest = min(float(np.quantile(distances, NEAR_QUANTILE)) for distances in visible)
         near = min(max(nearest, min_distance), max_distance)
         far = min(float(np.quantile(np.concatenate(visible), FAR_QUANTILE)), max_distance)

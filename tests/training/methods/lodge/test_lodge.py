@@ -255,6 +255,17 @@ def test_cost_of_distances():
     assert pruned.cost(levels, d_l, 5.0) == pytest.approx(4 / 16)
 
 
+def test_splats_that_no_view_sees_have_distances():
+    """Two splats behind a camera, at distances of 2 and 8."""
+    camera = Camera("v", 64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
+    means = np.float32([[0, 0, -2], [0, 0, -8]])
+    level = IndexedLevel.of(
+        Gaussians.of(Splats(means, np.eye(4, dtype=np.float32)[:2], means, means[:, 0], means[:, None]))
+    )
+    _, report = Thresholds([camera], 0.01, "cpu", 0.02, lambda d: 0.0).choose({2: level}, {2: 0.0})
+    assert 2 <= report["distances"][0] < report["distances"][-1] <= 8
+
+
 def test_chosen_distance_has_least_cost(data, base):
     lodge = make(data, base)
     trained(lodge)
