@@ -18,7 +18,13 @@ from ...errors import LodgsError
 from ...lod.rule import Values
 from ...lod.rules.bands import initial_gamma, min_scales
 from ...optimize import method
-from ...optimize.density_control import constrained_log_scales, densify, prune, reset_opacities
+from ...optimize.density_control import (
+    constrained_log_scales,
+    densify,
+    prune,
+    require_rows,
+    reset_opacities,
+)
 from ...optimize.initialize import (
     from_points,
     from_splats,
@@ -205,6 +211,7 @@ class Method(method.Method[FlodParameters, Drawing]):
             model.reset_stats()
         if due(p.prune_interval, local) and local >= p.densify_from:
             prune(model, p.min_opacity, p.opacity_decay * few_photos(len(self.data.train)))
+            require_rows(model, step, "min_opacity")
         if due(p.overlap_interval, local) and level < p.levels:
             model.keep(well_separated(model.read("means").cpu(), s_min / 2))
         if due(p.opacity_reset_interval, local) and local < self._densify_until(step):

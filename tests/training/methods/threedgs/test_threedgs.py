@@ -123,8 +123,9 @@ def test_other_rates_fall_at_the_end(data, name):
         assert lr["sh"][0].item() == pytest.approx(factor * parameters.lr_sh, rel=0.01)
 
 
-def test_transparent_model_raises(data):
-    method = make(data, steps=10, prune_interval=1, min_opacity=1.0)
+@pytest.mark.parametrize("name", ["3dgs", "flod"])
+def test_transparent_model_raises(data, name):
+    method = make(data, name, steps=10, prune_interval=1, min_opacity=1.0)
     with pytest.raises(LodgsError, match=r"no splats remain at step 1.*Lower or disable 'min_opacity'"):
         method.train_step(0)
 
