@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gpu
@@ -20,6 +21,9 @@ MAX_TEXTURES = 8
 """Maximum number of textures for records."""
 BLOCK = 1024
 """Number of splats per instance of the quads: drivers draw small instances slowly, software by far."""
+COMPACT = 6.0
+"""Squared radius of compact splats in standard deviations. The integral of (1 - r^2 / 6)^2 is that of a
+Gaussian."""
 
 _FETCH = """
 vec4 texel(sampler2D data, int i) { return texelFetch(data, ivec2(i % WIDTH, i / WIDTH), 0); }
@@ -168,16 +172,27 @@ void main()
 {
   int splat = gl_InstanceID * BLOCK + int(corner.z);
   vec4 center = texel(centers, splat), half_axes = texel(axes, splat);
-  position_in_sigmas = corner.xy * center.w;
+  vec2 position = corner.xy;
+#ifdef COMPACT
+  position *= min(1.0, sqrt(COMPACT) / center.w);
+#endif
+  position_in_sigmas = position * center.w;
   color_opacity = texel(colors, splat);
-  gl_Position = vec4(center.xy + corner.x * half_axes.xy + corner.y * half_axes.zw, center.z, 1.0);
+  gl_Position = vec4(center.xy + position.x * half_axes.xy + position.y * half_axes.zw, center.z, 1.0);
 }
 """
 )
 _SPLAT_FRAGMENT = """
 void main()
 {
-  float alpha = min(0.99, color_opacity.a * exp(-0.5 * dot(position_in_sigmas, position_in_sigmas)));
+  float squared = dot(position_in_sigmas, position_in_sigmas);
+#ifdef COMPACT
+  float falloff = max(1.0 - squared / COMPACT, 0.0);
+  falloff *= falloff;
+#else
+  float falloff = exp(-0.5 * squared);
+#endif
+  float alpha = min(0.99, color_opacity.a * falloff);
   if (alpha < 1.0 / 255.0) {
     discard;
   }
@@ -297,8 +312,8 @@ def bind_textures(shader: gpu.types.GPUShader, textures: dict[str, gpu.types.GPU
 
 
 def program(name: str) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Return the cached shader "splats", "depth" or "composite" with its quad or quads."""
-    return cached(name, lambda: (_SHADERS[name](), _triangles() if name == "splats" else _quad()))
+    """Return the cached shader "splats", "compact_splats", "depth" or "composite", with its batch."""
+    return cached(name, lambda: (_SHADERS[name](), _triangles() if name.endswith("splats") else _quad()))
 
 
 def projection_shader(textures: int) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
@@ -385,7 +400,7 @@ def _projection_shader(textures: int) -> gpu.types.GPUShader:
     )  # fmt: skip
 
 
-def _splat_shader() -> gpu.types.GPUShader:
+def _splat_shader(compact: bool = False) -> gpu.types.GPUShader:
     interface = gpu.types.GPUStageInterfaceInfo("lodgs_splats")
     interface.smooth("VEC2", "position_in_sigmas")
     interface.flat("VEC4", "color_opacity")
@@ -396,6 +411,8 @@ def _splat_shader() -> gpu.types.GPUShader:
         info.sampler(slot, "FLOAT_2D", name)
     info.define("WIDTH", str(WIDTH))
     info.define("BLOCK", str(BLOCK))
+    if compact:
+        info.define("COMPACT", str(COMPACT))
     return _create(info, interface, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
 
 
@@ -426,7 +443,12 @@ def _composite_shader() -> gpu.types.GPUShader:
     return _create(info, interface, _SCREEN_VERTEX, _COMPOSITE_FRAGMENT)
 
 
-_SHADERS = {"splats": _splat_shader, "depth": _depth_shader, "composite": _composite_shader}
+_SHADERS = {
+    "splats": _splat_shader,
+    "compact_splats": partial(_splat_shader, compact=True),
+    "depth": _depth_shader,
+    "composite": _composite_shader,
+}
 
 
 def _shader_info(name: str) -> tuple[gpu.types.GPUShaderCreateInfo, gpu.types.GPUStageInterfaceInfo]:

@@ -192,7 +192,7 @@ def draw(
         placements: transforms, filters and looks of the splat sets.
         target: view to draw.
         canvas: framebuffer to blend the splats in.
-        resolution: resolution of the splats relative to the framebuffer.
+        resolution: resolution of the splats relative to the framebuffer. Below 1, splats are compact.
         timed: wait until the splats are drawn.
 
     Returns:
@@ -219,16 +219,21 @@ def draw(
     with canvas.frame.bind():  # type: ignore[union-attr]
         canvas.frame.clear(color=(0, 0, 0, 0), depth=1.0)
         _write_depth(depth)
-        _blend(canvas.projections, count)
+        _blend(canvas.projections, count, _program_name(resolution))
         if timed:
             canvas.frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # waits for the graphics card
     _composite(canvas, overlay)
     return time.monotonic() - begin if timed else 0.0
 
 
-def is_compiled(store: UploadedSplats) -> bool:
-    """Return True if the shader for a store exists, so that a redraw does not wait for it."""
-    return is_cached(f"project_{len(store.textures)}")
+def is_compiled(store: UploadedSplats, resolution: float = 1.0) -> bool:
+    """Return True if the shaders for a store exist, so that a redraw does not wait for them."""
+    return is_cached(f"project_{len(store.textures)}") and is_cached(_program_name(resolution))
+
+
+def _program_name(resolution: float) -> str:
+    """Return the shader for a resolution: compact splats fill half as many pixels as exact ones."""
+    return "splats" if resolution == 1 else "compact_splats"
 
 
 def _write_depth(depth: gpu.types.GPUTexture) -> None:
@@ -271,12 +276,12 @@ def _project(
         quad.draw(shader)
 
 
-def _blend(projections: dict[str, gpu.types.GPUTexture], count: int) -> None:
+def _blend(projections: dict[str, gpu.types.GPUTexture], count: int, name: str) -> None:
     """Blend projected splats into the bound framebuffer."""
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(False)
     gpu.state.blend_set("ALPHA_PREMULT")
-    shader, quads = program("splats")
+    shader, quads = program(name)
     shader.bind()
     bind_textures(shader, projections)
     quads.draw_instanced(shader, instance_count=-(-count // BLOCK))

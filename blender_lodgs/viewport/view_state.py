@@ -31,7 +31,7 @@ FLUENT = 1 / 30
 """Seconds to draw the splats of a view up to which it keeps its resolution in motion."""
 SMOOTH = 0.2
 """Seconds per redraw above which a smaller budget is suggested, and a moving view is simplified."""
-MOTION = 0.12
+MOTION = 0.08
 """Seconds to draw the splats of a simplified view; Blender needs the rest of SMOOTH."""
 MIN_MOTION = 50_000
 """Smallest number of splats of a simplified view."""

@@ -137,7 +137,8 @@ def draw_splats(
     if view.arrangement is None or view.store is None or view.instances is None or not view.count:
         return
     view.choose_list()
-    timed &= view.loading is None and splats.is_compiled(view.store) and view.is_cost_outdated()
+    timed &= view.loading is None and splats.is_compiled(view.store, view.resolution)
+    timed &= view.is_cost_outdated()
     placements = view.arrangement.request.placements
     if _same_splats(placements, request.placements):  # objects move at once; their order follows
         placements = request.placements

@@ -206,10 +206,10 @@ def test_cost_is_measured_for_another_number_of_splats(lodgs, draw_from, monkeyp
 
     monkeypatch.setattr(splats, "_blend", slow_blend)
     monkeypatch.setattr(views, "draw_splats", lambda *a, **k: draw_splats(*a, **k, timed=True))
-    monkeypatch.setattr(splats, "is_compiled", lambda store: False)
+    monkeypatch.setattr(splats, "is_compiled", lambda *_: False)
     draw_from(view, 0.0)
     assert view.cost == (0, 0.0), "the first redraw waits for the shader"
-    monkeypatch.setattr(splats, "is_compiled", lambda store: True)
+    monkeypatch.setattr(splats, "is_compiled", lambda *_: True)
     draw_from(view, 0.0)
     assert view.cost == (view.count, 0.5) and not view.is_cost_outdated()
     view.count = round(0.8 * view.count)

@@ -372,15 +372,18 @@ def _plane(color, corners):
     return draw
 
 
-def test_mesh_occludes_with_pixel_accuracy(bpy, lodgs, add, draw_view, camera):
+@pytest.mark.parametrize(("resolution", "border"), [(1.0, 1), (0.5, 4)])
+def test_mesh_occludes_with_pixel_accuracy(bpy, lodgs, add, draw_view, camera, resolution, border):
     """Left of a projected oblique edge the mesh is visible, right of it all splats."""
     add(make_splats(lodgs, degree=0))
+    view = lodgs("viewport.views").ViewState(resolution=resolution)
     inverse = np.array(camera.matrix_world, float)
     # in camera space, in front of all splats
     corners = np.array([(-3, -3), (-0.15, -3), (0.15, 3), (-3, 3)], float)
     corners = np.c_[corners, np.full(4, -1.2), np.ones(4)] @ inverse.T
-    no_mesh = draw_view()
-    image = draw_view(draw_first=_plane((0, 0, 1, 1), [tuple(corner) for corner in corners[:, :3]]))
+    no_mesh = draw_view(view=view)
+    mesh = _plane((0, 0, 1, 1), [tuple(corner) for corner in corners[:, :3]])
+    image = draw_view(view=view, draw_first=mesh)
     projection = np.array(
         camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE, y=SIZE), float
     )
@@ -388,7 +391,7 @@ def test_mesh_occludes_with_pixel_accuracy(bpy, lodgs, add, draw_view, camera):
     edge = (edge[:, :2] / edge[:, 3:] * (1, -1) + 1) * SIZE / 2
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
     edge_x = edge[0, 0] + (y - edge[0, 1]) / (edge[1, 1] - edge[0, 1]) * (edge[1, 0] - edge[0, 0])
-    occluded, visible = x < edge_x - 1, x > edge_x + 1
+    occluded, visible = x < edge_x - border, x > edge_x + border
     assert occluded.mean() > 0.3 and visible.mean() > 0.3
     assert (image[occluded] == (0, 0, 1, 1)).all()
     assert np.array_equal(image[visible], no_mesh[visible])
@@ -416,6 +419,25 @@ def test_lines_do_not_hide_pixels_of_a_lower_resolution(bpy, lodgs, add, draw_vi
     opaque = without_line[:, column, 3] > 0.9
     assert opaque.mean() > 0.1
     assert np.abs(moving - without_line)[opaque, column].max() < 0.1
+
+
+def test_splats_of_a_lower_resolution_end_sooner(lodgs, add, draw_view):
+    """At r standard deviations, the opacity is 0.9 exp(-r^2 / 2), and in motion 0.9 (1 - r^2 / 6)^2."""
+    grey = make_splats(lodgs, 1)
+    grey.means[:], grey.log_scales[:], grey.opacity_logits[:] = 0, -1, np.log(9)
+    grey.sh[:] = (0.6 - 0.5) / 0.28209479177387814
+    add(grey)
+    view = lodgs("viewport.views").ViewState()
+    resting = displayed(draw_view(view=view))[..., 0] / 0.6
+    assert view.canvas.size == (SIZE, SIZE)
+    view.resolution = 0.5
+    moving = displayed(draw_view(view=view))[..., 0] / 0.6
+    assert view.canvas.size == (SIZE // 2, SIZE // 2)
+    squared = -2 * np.log(np.maximum(resting, 0.02) / 0.9)
+    inside = resting > 0.02
+    assert inside.mean() > 0.05
+    assert np.abs(moving - 0.9 * np.maximum(1 - squared / 6, 0) ** 2)[inside].max() < 0.01
+    assert (moving[~inside] == 0).all() and (resting[~inside] > 0).any()
 
 
 @pytest.mark.parametrize("antialias", [False, True])
