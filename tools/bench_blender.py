@@ -295,9 +295,10 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         return
     gpu.init()
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    views, view_camera, visible = (
-        load(f"blender_lodgs.{name}") for name in ("viewport.views", "viewport.view_camera", "data.shown")
+    sources, views, view_camera = (
+        load(f"blender_lodgs.viewport.{name}") for name in ("sources", "views", "view_camera")
     )
+    visible = load("blender_lodgs.data.shown")
     import_start = time.perf_counter()
     root = load("blender_lodgs.data.importing").import_splats(bpy.context, path, upright=False, budget=budget)
     imported = time.perf_counter() - import_start
@@ -321,7 +322,7 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
 
     def wait() -> float:
         start = time.perf_counter()
-        while not (stream := views.stream(root)) or stream.busy or view.pending or views.wants_redraw(view):
+        while not (stream := sources.stream(root)) or stream.busy or view.pending or views.wants_redraw(view):
             spent.append(redraw(positions[-1]))
             time.sleep(1 / 60)
         return time.perf_counter() - start
@@ -342,7 +343,7 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         bpy.context.view_layer.update()
 
     update = fastest(store_and_evaluate, 1)
-    stream = views.stream(root)
+    stream = sources.stream(root)
     assert stream is not None and not stream.problem, stream and stream.problem
     wall, cpu = 1e3 * np.array(spent).T
     print(
@@ -354,7 +355,7 @@ def streaming(bpy, path: Path, budget: int, frames: int = 100) -> None:
         f"  loaded {loading:.1f} s after opening, {settled:.1f} s after the flight"
     )
     views.clear()
-    views.close_streams()
+    sources.close_streams()
 
 
 def main() -> None:

@@ -280,10 +280,11 @@ def all_cameras() -> list:
 
 def loaded() -> Steps:
     """Wait until all data is loaded."""
-    views, (root,) = module("viewport.views"), module("data.roots").roots(bpy.context.scene)
+    views, sources = module("viewport.views"), module("viewport.sources")
+    (root,) = module("data.roots").roots(bpy.context.scene)
 
     def is_loaded() -> bool:
-        stream = views.stream(root)
+        stream = sources.stream(root)
         states = views._views.values()
         busy = any(view.pending or view.resolution < 1 or views.wants_redraw(view) for view in states)
         return bool(states) and not busy and stream is not None and not stream.busy

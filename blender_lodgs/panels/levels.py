@@ -10,7 +10,7 @@ from ...training.lod.rule import find_rule
 from ...training.lod.selection import unknown_rule_error
 from ..data import detail, metadata, objects, roots, scenes, streams
 from ..nodes.camera_choices import find_choice
-from ..viewport import views
+from ..viewport import sources
 from .parts import LevelsPanel, say, sidebar_width, split_column
 
 MIN_SAVED = 0.05
@@ -175,7 +175,7 @@ class LODGS_PT_stream(LevelsPanel):
 
     def draw(self, context):
         root, layout = roots.active_root(context), self.layout
-        stream = views.stream(root)
+        stream = sources.stream(root)
         settings = root.lodgs.stream
         resident = settings.scene_splats + (stream.splats if stream is not None and stream.ready else 0)
         resident = min(resident, settings.total)  # streamed pages repeat the splats of the scene

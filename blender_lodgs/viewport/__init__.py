@@ -5,6 +5,7 @@ splats are points like those of COLMAP: discs in Solid shading, Blender's point 
 and later can draw splats natively (``Scene.lodgs_viewport.drawn_by``).
 
 - ``views`` draws a viewport, ``view_state`` loads its splats, ``arrangement`` selects and sorts them.
+- ``sources`` reads changed splats and starts streams.
 - ``resident`` uploads splats, ``streaming`` reads them from disk, ``shaders`` draws them.
 - ``view_camera`` tracks the camera of a viewport's view.
 - ``frusta`` draws training and capture views, ``coverage`` the coverage of a Blender scene by capture views.
@@ -22,7 +23,7 @@ import bpy
 from ...training.splats.level_colors import level_color
 from .. import extension
 from ..data import roots
-from . import cells, coverage, discs, frusta, shaders, splats, view_camera, views
+from . import cells, coverage, discs, frusta, shaders, sources, splats, view_camera, views
 
 if TYPE_CHECKING:
     from ..data.scene_properties import SplatScene
@@ -122,7 +123,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
 
 @bpy.app.handlers.persistent
 def _on_file(*_) -> None:
-    views.close_streams()
+    sources.close_streams()
 
 
 @bpy.app.handlers.persistent
@@ -138,7 +139,7 @@ def _on_undo(*_) -> None:
     problem = ""
     coverage.clear()
     discs.clear()
-    views.forget_datablocks()
+    sources.forget_datablocks()
     view_camera.clear()
 
 
@@ -170,5 +171,5 @@ def unregister() -> None:
         bpy.app.timers.unregister(_store_shading)
     _on_load()
     shaders.clear()
-    views.stop()
+    sources.stop()
     _handle = None

@@ -1,57 +1,29 @@
 """Drawing of splats in viewports.
 
-All splats to draw are in one pool in memory (``resident``). They are read again only if the points of an
-object change: levels of detail come from the settings of modifiers (``selection.evaluated_query``), so time
-and views do not change splats. Objects with other modifiers are read after evaluation. A worker thread
-selects the splats when a query changes and sorts them when the view turns (``arrangement``); ``view_state``
-uploads them in small steps.
-
-For streamed files (``streaming``), the worker thread also copies new pages, while no viewport uploads them.
+A worker thread selects the splats when a query changes and sorts them when the view turns (``arrangement``);
+``view_state`` uploads them in small steps. All splats are in ``sources``.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from math import inf
 
 import bpy
-import numpy as np
 from mathutils import Matrix
 
 from .. import extension
-from ..data import changes, roots, selection, shown
+from ..data import shown
 from ..nodes import display
-from . import resident, splats, view_camera, view_state
+from . import sources, splats, view_camera, view_state
 from .arrangement import Placement, Request, arrange
-from .resident import Cloud, PoolReader, Resident
-from .streaming import Direction, Stream
+from .resident import Resident
 from .view_state import ViewState, active_views
 
 REST = 0.2
 """Seconds without movement after which a view is at rest."""
-ROUNDING = 1e-4
-"""Relative difference below which positions count as equal."""
-NOT_REQUESTED = -1
-"""Value of ``ViewState.arrived`` that makes the viewport redraw until streams are requested."""
-
-reads = 0
-"""Number of times the pool was read since Blender started, for tests."""
-
 
 _views: dict[int, ViewState] = {}
-_executor: ThreadPoolExecutor | None = None
-
-_resident: Resident | None = None
-_versions: dict[int, changes.Version | Stream | None] = {}
-"""Versions of the read splats, by the ``session_uid`` of a point cloud, of an object with other modifiers, or
-of the root of a streamed scene; None for objects that only a render shows."""
-_reader: tuple[tuple, PoolReader] | None = None
-"""Unfinished reader of the next pool, and a key of its splats."""
-_streams: dict[int, Stream] = {}
-"""Streams by the ``session_uid`` of their roots."""
 _panel_state: list[tuple[int, bool, bool]] = []
 """State of the streams in panels at their last redraw."""
 
@@ -89,7 +61,7 @@ def draw(context: bpy.types.Context) -> None:
         for other in context.area.regions:
             if other.type in ("HEADER", "UI"):
                 other.tag_redraw()
-    if _is_loading(view) or view.pending is not None or view.moving or _is_streaming():
+    if _is_loading(view) or view.pending is not None or view.moving or sources.is_streaming():
         _wake_later()
 
 
@@ -176,15 +148,15 @@ def prepare(
     active_views.add(view)
     previous_arrived = view.arrived
     view.arrived = 0
-    instances = _with_streams(view, instances, depsgraph, view_matrix, moving, wait)
-    read = _read(instances, depsgraph, wait)
+    instances = sources.with_streams(view, instances, depsgraph, view_matrix, moving, wait)
+    read = sources.read(instances, depsgraph, wait)
     if read is None:
-        view.arrived = NOT_REQUESTED
+        view.arrived = sources.NOT_REQUESTED
         return empty
     source, clouds = read
     update = wait or not any(other.uses(source) for other in active_views if other is not view)
-    arrived = _arrived()
-    placements = _placements(instances, source, depsgraph, moving, update)
+    arrived = sources.arrived()
+    placements = sources.placements(instances, source, depsgraph, moving, update)
     request = replace(empty, placements=placements)
     position = tuple(view_matrix.inverted().translation)
     if sum(placement.count for placement in placements) > budget:
@@ -192,7 +164,7 @@ def prepare(
     if not wait and (limit := view.motion_limit()) is not None:
         request = replace(request, motion=(limit, position), moving=view.moving)
     is_requested = _arrange(view, source, request, wait, update)
-    if view.arrived != NOT_REQUESTED:  # an older value makes the view redraw
+    if view.arrived != sources.NOT_REQUESTED:  # an older value makes the view redraw
         view.arrived = arrived if update and is_requested else previous_arrived
     source.update_marks(clouds)
     source.update_paint(clouds)
@@ -221,176 +193,6 @@ def reduced_counts(region: bpy.types.Region | None = None) -> tuple[int, int] | 
     )
 
 
-def stream(root: bpy.types.Object) -> Stream | None:
-    """Return the stream of a splat scene; None if it is not streamed."""
-    return _streams.get(root.session_uid)
-
-
-def _with_streams(
-    view: ViewState,
-    instances: list[shown.SplatInstance],
-    depsgraph: bpy.types.Depsgraph,
-    view_matrix: Matrix,
-    moving: bool,
-    wait: bool,
-) -> list[shown.SplatInstance]:
-    """Return the instances with streams in place of their levels where streams are ready.
-
-    Request the pages that the camera needs, and start missing streams.
-    """
-    ready = []
-    for instance, query in view_camera.nearest_streamed(instances, depsgraph, moving):
-        source = instance.source
-        assert source is not None
-        current = _streams.get(source.scene)
-        if current is None or current.source != source:
-            if current is not None:
-                current.stop()
-            current = _streams[source.scene] = Stream(source)
-        if query is not None and not (current.problem and not current.ready):
-            current.request(query, _direction(instance, query, view_matrix))
-            while wait and current.busy and not current.problem:
-                if current.ready:
-                    _worker().submit(current.take).result()
-                time.sleep(0.01)
-            # draw the splats of the scene first, which are in memory
-            replaces_levels = wait or current in _versions.values() or (view.arrangement and not view.loading)
-            if current.ready and replaces_levels:
-                ready.append(source)
-            elif current.ready:
-                view.arrived = NOT_REQUESTED
-    return shown.drop_streamed_levels(
-        [instance if instance.source in ready else replace(instance, source=None) for instance in instances]
-    )
-
-
-def _direction(
-    instance: shown.SplatInstance, query: selection.LodQuery, view_matrix: Matrix
-) -> Direction | None:
-    """Return the view direction in the splats' space; None if the query is for another camera position."""
-    camera_to_local = np.linalg.pinv(instance.matrix_world) @ np.array(view_matrix.inverted(), np.float64)
-    distance = np.linalg.norm(camera_to_local[:3, 3] - query.position)
-    if distance > ROUNDING * (1 + np.linalg.norm(camera_to_local[:3, 3])):
-        return None
-    x, y, z = (-camera_to_local[:3, 2] / max(np.linalg.norm(camera_to_local[:3, 2]), 1e-30)).tolist()
-    return x, y, z
-
-
-def _streamed_clouds(instances: list[shown.SplatInstance]) -> Iterator[bpy.types.PointCloud]:
-    """Yield the point clouds of levels that streams replace."""
-    for instance in instances:
-        root = roots.root_of(instance.object) if instance.source is not None else None
-        for item in root.lodgs.levels if root is not None else ():
-            if item.exists:
-                yield item.object.data
-
-
-def _is_streaming() -> bool:
-    return any(stream.busy for stream in _streams.values())
-
-
-def _arrived() -> int:
-    """Return a number that grows whenever streams have brought splats."""
-    return sum(stream.ready + stream.arrived for stream in _streams.values())
-
-
-def _is_unmodified(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> bool:
-    return selection.only_lodgs_modifiers(instance.evaluated, depsgraph)
-
-
-def _key(instance: shown.SplatInstance, depsgraph: bpy.types.Depsgraph) -> int:
-    """Return the key of an instance's splats: that of its point cloud, modified object or streamed scene."""
-    if instance.source is not None:
-        return instance.source.scene
-    return (instance.object.data if _is_unmodified(instance, depsgraph) else instance.object).session_uid
-
-
-def _read(
-    instances: list[shown.SplatInstance], depsgraph: bpy.types.Depsgraph, wait: bool
-) -> tuple[Resident, list[Cloud | None]] | None:
-    """Read the splats of all instances if some have changed.
-
-    Returns:
-        The splats and their clouds. None if reading continues at the next redraw.
-    """
-    global _resident, _versions, _reader, reads
-    clouds: dict[int, Cloud] = {}
-    versions: dict[int, changes.Version | Stream | None] = {}
-    for instance in instances:
-        if instance.source is not None:
-            key = instance.source.scene
-            clouds[key] = versions[key] = _streams[key]
-            continue
-        unmodified = _is_unmodified(instance, depsgraph)
-        key = _key(instance, depsgraph)
-        clouds.setdefault(key, instance.object.data if unmodified else instance.evaluated.data)
-        versions[key] = changes.version(instance.object.data if unmodified else instance.object)
-        if not unmodified and depsgraph.mode == "RENDER":  # modifiers may differ in viewports
-            versions[key] = None
-    if _resident is None or any(
-        version is None or _versions.get(key) != version for key, version in versions.items()
-    ):
-        # hidden levels stay in the pool: artists step through levels
-        all_clouds = {cloud.session_uid: cloud for cloud in bpy.data.pointclouds if shown.is_splats(cloud)}
-        for cloud in _streamed_clouds(instances):  # their stream takes the memory
-            all_clouds.pop(cloud.session_uid, None)
-        hidden = {key: all_clouds[key] for key in _versions if key in all_clouds and key not in clouds}
-        versions |= {key: changes.version(cloud) for key, cloud in hidden.items()}
-        clouds |= hidden
-        clouds = {key: clouds[key] for key in _versions | clouds if key in clouds}
-        pool_versions = {key: versions[key] for key in clouds}
-        cloud_list = list(clouds.values())
-        reader_key = pool_versions, list(pool_versions), list(map(resident.splat_count, cloud_list))
-        if _reader is None or _reader[0] != reader_key:
-            _reader = reader_key, PoolReader(cloud_list, _resident if [*_versions] == [*clouds] else None)
-        start = time.monotonic()
-        pool = _reader[1].advance(cloud_list, inf if wait else start + view_state.LOADING[1])
-        if pool is None:
-            return None
-        reads += pool is not _resident
-        _resident, _versions, _reader = pool, pool_versions, None
-        close_streams({obj.session_uid for obj in bpy.data.objects if obj.lodgs.is_root})
-        if not wait and time.monotonic() > start + view_state.LOADING[0]:
-            return None
-    return _resident, [clouds.get(key) for key in _versions]
-
-
-def _placements(
-    instances: list[shown.SplatInstance],
-    source: Resident,
-    depsgraph: bpy.types.Depsgraph,
-    moving: bool,
-    update: bool,
-) -> tuple[Placement, ...]:
-    """Return the rows of each instance in ``source``, with its transform and query."""
-    root_of_level = {
-        item.object: root for root in roots.roots(depsgraph.scene) for item in root.lodgs.existing_levels
-    }
-    numbers = {key: number for number, key in enumerate(_versions)}
-    placements = []
-    for instance in instances:
-        number = numbers[_key(instance, depsgraph)]
-        root = root_of_level.get(instance.object)
-        if root is None and instance.level:  # in an instance of another file's scene
-            root = roots.root_of(instance.object)
-        paged = instance.source and _streams[instance.source.scene]
-        placements.append(
-            Placement(
-                first=source.starts[number],
-                count=source.counts[number],
-                matrix=instance.matrix_world.tobytes(),
-                level=instance.level,
-                query=view_camera.view_query(instance, depsgraph, moving),
-                scene=(root or instance.object).session_uid,
-                colors=root.lodgs.colors if root else "OWN",
-                antialias=instance.antialias,
-                arrived=(paged.arrived if update else paged.copied_updates) if paged else 0,
-                looks=instance.looks,
-            )
-        )
-    return tuple(placements)
-
-
 def _arrange(view: ViewState, source: Resident, request: Request, wait: bool, update: bool) -> bool:
     """Accept a finished arrangement, and request another one if needed.
 
@@ -413,20 +215,12 @@ def _arrange(view: ViewState, source: Resident, request: Request, wait: bool, up
         return False
     if current is not None and not wait:  # a waiting render depends on nothing before
         request = replace(request, coarsened=current.coarsened)
-    view.pending = (source, request, _worker().submit(arrange, source.pool, request, update))
+    view.pending = (source, request, sources.worker().submit(arrange, source.pool, request, update))
     if wait:
         arrangement = view.pending[2].result()
         view.pending = None
         view.accept(source, arrangement)
     return True
-
-
-def _worker() -> ThreadPoolExecutor:
-    """Return the single worker thread, which arranges splats and copies streamed pages."""
-    global _executor
-    if _executor is None:
-        _executor = ThreadPoolExecutor(1, "lodgs-order")
-    return _executor
 
 
 def _same_splats(first: tuple[Placement, ...], second: tuple[Placement, ...]) -> bool:
@@ -445,14 +239,14 @@ def wants_redraw(view: ViewState) -> bool:
 
 
 def _is_loading(view: ViewState) -> bool:
-    return view.loading is not None or view.arrived != _arrived()
+    return view.loading is not None or view.arrived != sources.arrived()
 
 
 def _wake() -> float | None:
     """Redraw viewports with new splats. Return the delay to the next call while splats are loading."""
     global _panel_state
     now = time.monotonic()
-    waiting = _is_streaming()
+    waiting = sources.is_streaming()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions if area.type == "VIEW_3D" else ():
@@ -463,7 +257,7 @@ def _wake() -> float | None:
                 if rests or wants_redraw(view):
                     region.tag_redraw()
                 waiting |= _is_loading(view) or view.pending is not None or view.moving
-    state = [(stream.splats, stream.busy, stream.short) for stream in _streams.values()]
+    state = sources.stream_states()
     if state != _panel_state:
         _panel_state = state
         extension.redraw()
@@ -472,28 +266,6 @@ def _wake() -> float | None:
 
 def clear() -> None:
     """Free all splats and viewport states."""
-    global _resident, _versions, _reader
     _views.clear()
     active_views.clear()
-    _resident, _versions, _reader = None, {}, None
-
-
-def forget_datablocks() -> None:
-    """Drop references to point clouds, which an undo replaces. All splats are read again."""
-    global _reader
-    _reader = None
-
-
-def close_streams(keep: Collection[int] = ()) -> None:
-    """Stop all streams except those of these roots (``session_uid``)."""
-    for key in _streams.keys() - keep:
-        _streams.pop(key).stop()
-
-
-def stop() -> None:
-    """Stop the threads."""
-    global _executor
-    close_streams()
-    if _executor is not None:
-        _executor.shutdown(wait=False, cancel_futures=True)
-    _executor = None
+    sources.clear()

@@ -212,11 +212,11 @@ def test_state_of_streaming_is_shown(bpy, lodgs, draw, draw_panel, tmp_path, mon
     def texts():
         return draw_panel("levels", "LODGS_PT_stream").texts
 
-    views, streaming = lodgs("viewport.views"), lodgs("viewport.streaming")
+    sources, streaming = lodgs("viewport.sources"), lodgs("viewport.streaming")
     assert texts() == ["499 of 5,999 splats in memory", "Streams when the viewport draws splats"]
     monkeypatch.setattr(streaming.Stream, "_open", lambda self: None)
     stream = streaming.Stream(lodgs("data.streams").source_of(root))
-    monkeypatch.setitem(views._streams, root.session_uid, stream)
+    monkeypatch.setitem(sources._streams, root.session_uid, stream)
     assert texts()[1:] == ["Loading finer splats…"]
     monkeypatch.setattr(streaming.Stream, "splats", 5999)
     stream.ready = True

@@ -94,13 +94,13 @@ def test_viewports_equal_the_export(bpy, lodgs, image, tmp_path):
     root = importing.import_splats(bpy.context, write_splats(tmp_path), upright=False)
     root.location, root.rotation_euler = (1, 2, 0), (0.1, 0.2, 0.7)
     original = image(viewport_quality)
-    sphere, views = add_looks(bpy, root), lodgs("viewport.views")
+    sphere, sources = add_looks(bpy, root), lodgs("viewport.sources")
     looked = image(viewport_quality)
-    read = views.reads
+    read = sources.reads
     assert np.abs(original - looked).max() > 0.05
     sphere.lodgs_look.exposure += 1
     assert (
-        np.abs(image(viewport_quality) - looked).max() > 0.02 and views.reads == read
+        np.abs(image(viewport_quality) - looked).max() > 0.02 and sources.reads == read
     )  # no splat is read again
     sphere.lodgs_look.exposure -= 1
     sphere.empty_display_type = "CUBE"
@@ -163,7 +163,7 @@ def test_painting_does_not_read_splats_again_in_viewports(bpy, lodgs, image, tmp
     """Splats with a modifier of the user are read again."""
     viewport_quality = lodgs("render.viewport_quality")._render_frame
     importing = lodgs("data.importing")
-    views = lodgs("viewport.views")
+    sources = lodgs("viewport.sources")
     root = importing.import_splats(bpy.context, write_splats(tmp_path), upright=False)
     root.lodgs.mode, root.lodgs.single_level = "SINGLE", 3
     if modifier:
@@ -176,14 +176,14 @@ def test_painting_does_not_read_splats_again_in_viewports(bpy, lodgs, image, tmp
     original = image(viewport_quality)
     painting = lodgs("data.painting")
     paint = half_painted(lodgs, root)
-    read = views.reads
+    read = sources.reads
     painting.preview_paint(root, paint)  # during a stroke
     during = image(viewport_quality)
     painting.preview_paint(root, {})
     np.testing.assert_array_equal(image(viewport_quality), original)
     painting.write_paint(root, paint)
     painted = image(viewport_quality)
-    assert np.abs(original - painted).max() > 0.05 and (views.reads == read) == (not modifier)
+    assert np.abs(original - painted).max() > 0.05 and (sources.reads == read) == (not modifier)
     np.testing.assert_array_equal(during, original if modifier else painted)
     painting.write_paint(
         root, painting.blend(paint, {n: np.full(len(x), 0.5) for n, x in paint.items()}, None)

@@ -86,6 +86,7 @@ def test_viewport_quality_waits_for_streaming(bpy, lodgs, path, camera, frame):
     gpu = pytest.importorskip("gpu")
     if not hasattr(gpu, "init"):
         pytest.skip("no graphics in background before Blender 5.2")
+    sources = lodgs("viewport.sources")
     views = lodgs("viewport.views")
     images = []
     for budget in (16_000, 0):
@@ -93,13 +94,13 @@ def test_viewport_quality_waits_for_streaming(bpy, lodgs, path, camera, frame):
         frame(root, 20.0)
         lodgs("render.viewport_quality").render(bpy.context)
         if budget:
-            assert views.stream(root).ready and views.stream(root).splats <= budget
+            assert sources.stream(root).ready and sources.stream(root).splats <= budget
         depsgraph = bpy.context.evaluated_depsgraph_get()
         render = lodgs("render.viewport_quality")._render_frame
         planes = render(depsgraph, 160, 120, (0, 0, 160, 120), lambda *_: True).planes
         images.append(np.stack([planes[f"Combined.{channel}"] for channel in "RGB"], axis=2))
         views.clear()
-        views.close_streams()
+        sources.close_streams()
         lodgs("data.removal").remove(root)
     np.testing.assert_allclose(*images, atol=2e-3)
     assert images[0].max() > 0.1

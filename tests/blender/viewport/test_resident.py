@@ -242,6 +242,7 @@ def test_viewports_that_load_at_once_upload_each_splat_once(lodgs, draw_from, mo
 
 def test_each_redraw_reads_an_attribute(bpy, lodgs, draw_from, scene, monkeypatch):
     """The old image stays until the pool is complete; another change restarts reading."""
+    sources = lodgs("viewport.sources")
     views, view = lodgs("viewport.views"), lodgs("viewport.views").ViewState()
     before, cloud = draw_from(view, 0.0), scene.lodgs.levels[1].object.data
     positions = np.zeros(3 * COUNT, np.float32)
@@ -253,10 +254,10 @@ def test_each_redraw_reads_an_attribute(bpy, lodgs, draw_from, scene, monkeypatc
         bpy.context.view_layer.update()
 
     def redraws(limit=1000):
-        reads, count = views.reads, 0
-        while views.reads == reads and count < limit:
+        reads, count = sources.reads, 0
+        while sources.reads == reads and count < limit:
             image, count = draw_from(view, 0.0, wait=False), count + 1
-            assert views.reads > reads or views.wants_redraw(view)
+            assert sources.reads > reads or views.wants_redraw(view)
             np.testing.assert_array_equal(image, before)
         return count
 
@@ -306,6 +307,7 @@ def test_old_image_stays_after_an_undo(bpy, lodgs, draw_from, scene, monkeypatch
 @pytest.mark.parametrize("name", [None, "rotation", "radiance:sh_2"])
 def test_undo_uploads_only_changed_splats(bpy, lodgs, draw_from, scene, monkeypatch, name):
     """Blender reports all points after an undo. Splats stay on the graphics card if they are the same."""
+    sources = lodgs("viewport.sources")
     views, resident, changes = lodgs("viewport.views"), lodgs("viewport.resident"), lodgs("data.changes")
     view, cloud_name = views.ViewState(), scene.lodgs.levels[1].object.data.name
     expected = draw_from(view, 0.0)
@@ -322,14 +324,14 @@ def test_undo_uploads_only_changed_splats(bpy, lodgs, draw_from, scene, monkeypa
     bpy.ops.ed.undo_push(message="Change")
     version, reads, uploaded = (
         changes.version(bpy.data.pointclouds[cloud_name]),
-        views.reads,
+        sources.reads,
         resident.bytes_uploaded,
     )
     assert bpy.ops.ed.undo() == {"FINISHED"}
     monkeypatch.setattr(lodgs("data.selection"), "store_camera", lambda *arguments: None)  # undone as well
     np.testing.assert_array_equal(draw_from(view, 0.0), expected)
     assert changes.version(bpy.data.pointclouds[cloud_name]) != version
-    assert (views.reads > reads) == (resident.bytes_uploaded > uploaded) == (name is not None)
+    assert (sources.reads > reads) == (resident.bytes_uploaded > uploaded) == (name is not None)
 
 
 def test_splats_can_be_removed_during_loading(bpy, lodgs, draw_from, scene, monkeypatch):

@@ -512,6 +512,7 @@ def test_compositing_over_white_and_black_matches_display_space(bpy, lodgs, add,
 
 def test_only_changed_splats_are_read_again(bpy, lodgs, camera, draw_view, frame):
     """Time, views, selection by distance, displayed levels and object motion do not repeat reads."""
+    sources = lodgs("viewport.sources")
     scenes, bundle, views = lodgs("data.scenes"), lodgs("training.splats.bundle"), lodgs("viewport.views")
     scene = bpy.context.scene
     with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
@@ -533,7 +534,7 @@ def test_only_changed_splats_are_read_again(bpy, lodgs, camera, draw_view, frame
         return image
 
     first = draw()
-    reads = views.reads
+    reads = sources.reads
     images = [first]
     for number in (5, 10, 20):
         scene.frame_set(number)
@@ -548,25 +549,25 @@ def test_only_changed_splats_are_read_again(bpy, lodgs, camera, draw_view, frame
         root.lodgs.single_level = number
         bpy.context.view_layer.update()
         draw()
-    assert views.reads == reads
+    assert sources.reads == reads
     cloud = root.lodgs.levels[1].object.data
     cloud.attributes["position"].data.foreach_set("vector", np.zeros(1500, np.float32))
     cloud.update_tag()
     bpy.context.view_layer.update()
     last = images[-1]
-    assert not np.array_equal(draw(), last) and views.reads == reads + 1
+    assert not np.array_equal(draw(), last) and sources.reads == reads + 1
 
 
 def test_modifiers_of_artists_are_drawn(bpy, lodgs, add, draw_view):
     """Splats are read again after a change of their geometry nodes."""
-    views, view = lodgs("viewport.views"), lodgs("viewport.views").ViewState()
+    sources, view = lodgs("viewport.sources"), lodgs("viewport.views").ViewState()
     obj = add(make_splats(lodgs, 500))
     before = draw_view(view=view)
     obj.modifiers.new("move", "NODES").node_group = make_move_group(bpy, (0, 0, 0.5))
     bpy.context.view_layer.update()
-    reads = views.reads
+    reads = sources.reads
     after = draw_view(view=view)
-    assert views.reads == reads + 1
+    assert sources.reads == reads + 1
     obj.modifiers.remove(obj.modifiers["move"])
     obj.location.z = 0.5
     bpy.context.view_layer.update()

@@ -35,7 +35,7 @@ def root(bpy, lodgs, path, monkeypatch):
     root = lodgs("data.importing").import_splats(bpy.context, path, upright=False, budget=BUDGET)
     yield root
     lodgs("viewport.views").clear()
-    lodgs("viewport.views").close_streams()
+    lodgs("viewport.sources").close_streams()
 
 
 @pytest.fixture
@@ -69,6 +69,7 @@ def drawn_means(view):
 
 
 def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path, root, draw_from):
+    sources = lodgs("viewport.sources")
     views, truth = lodgs("viewport.views"), Truth(tree)
     paging = lodgs("training.lod.tree.paging")
     index = paging.TreeFile(path).index()
@@ -78,14 +79,14 @@ def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path,
         for pixels in (30.0, 8.0):
             until = time.monotonic() + 200
             while time.monotonic() < until:
-                previous = views.stream(root)
+                previous = sources.stream(root)
                 settled = previous is not None and previous.ready and not previous.busy
                 draw_from(root, view, position, pixels)
                 complete |= 0 < view.count == view.arrangement.count  # the first splats arrive in parts
                 if complete:
                     numbers.append(truth.nodes(drawn_means(view)))
                     truth.require_complete(numbers[-1])
-                stream = views.stream(root)
+                stream = sources.stream(root)
                 if settled and not stream.busy and not view.pending and not view.loading:
                     break
                 time.sleep(0.005)
@@ -102,13 +103,14 @@ def test_cuts_are_complete_while_finer_splats_are_loaded(bpy, lodgs, tree, path,
 
 def test_resting_view_redraws_until_loading_ends(lodgs, root, draw_from, monkeypatch):
     """Windows redraw only on request, and loading takes several redraws."""
+    sources = lodgs("viewport.sources")
     views, position = lodgs("viewport.views"), POSITIONS[0]
     view, slices = views.ViewState(), 0
     monkeypatch.setattr(lodgs("viewport.view_state"), "LOADING", (0.0, 0.0))
     draw_from(root, view, position, 30.0)
     until = time.monotonic() + 200
     while time.monotonic() < until:
-        stream = views.stream(root)
+        stream = sources.stream(root)
         if views.wants_redraw(view):
             draw_from(root, view, position, 30.0)
             slices += view.loading is not None
@@ -154,6 +156,7 @@ def test_two_viewports_draw_complete_cuts(bpy, lodgs, tree, root, draw_from, mon
 
 
 def test_missing_files_leave_the_splats_of_the_scene(bpy, lodgs, path, tree, root, draw_from, tmp_path):
+    sources = lodgs("viewport.sources")
     views, truth = lodgs("viewport.views"), Truth(tree)
     path.rename(tmp_path / "moved.ply")
     view = views.ViewState()
@@ -161,19 +164,19 @@ def test_missing_files_leave_the_splats_of_the_scene(bpy, lodgs, path, tree, roo
     def draw():
         until = time.monotonic() + 200
         while time.monotonic() < until:
-            previous = views.stream(root)
+            previous = sources.stream(root)
             settled = previous is not None and not previous.busy
             draw_from(root, view, POSITIONS[1], 30.0)
-            if settled and not view.pending and not view.loading and not views.stream(root).busy:
+            if settled and not view.pending and not view.loading and not sources.stream(root).busy:
                 break
             time.sleep(0.01)
         return truth.nodes(drawn_means(view))
 
     truth.require_complete(draw())
-    assert "town.ply" in views.stream(root).problem and not views.stream(root).ready
+    assert "town.ply" in sources.stream(root).problem and not sources.stream(root).ready
     root.lodgs.stream.file = str(tmp_path / "moved.ply")
     nodes = draw()
-    assert not views.stream(root).problem
+    assert not sources.stream(root).problem
     np.testing.assert_array_equal(np.sort(nodes), truth.cut(POSITIONS[1], 30.0))
     shutil.copy(path.with_name("moved.ply"), path)
 
@@ -183,7 +186,7 @@ def test_replaced_file_is_reported(bpy, lodgs, path, root, draw_from):
     bundle.write_bundle(path, tree_of(random_leaves(3000, np.random.default_rng(1), degree=1)))
     view = lodgs("viewport.views").ViewState()
     draw_from(root, view, POSITIONS[0], wait=True)
-    assert "instead of 23,999" in lodgs("viewport.views").stream(root).problem
+    assert "instead of 23,999" in lodgs("viewport.sources").stream(root).problem
     assert view.count
 
 
@@ -241,4 +244,4 @@ def test_saved_scenes_keep_streaming(bpy, lodgs, root, path, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a" / "scene.blend"))
     source = streams.source_of(bpy.data.objects[name])
     assert source.path == tmp_path / "a" / "town.ply" and source.total == 2 * LEAVES - 1
-    assert not lodgs("viewport.views")._streams
+    assert not lodgs("viewport.sources")._streams
