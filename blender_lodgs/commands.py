@@ -29,7 +29,7 @@ from ..training.splats.bundle import write_bundle
 from ..training.splats.formats import FORMATS, PLY, find_format
 from ..training.splats.origin import describe_origin
 from . import extension
-from .data import importing, scenes, viewpoints
+from .data import importing, photographs, scenes, viewpoints
 from .data.paths import save_file
 from .render import engine
 from .render.capture import noise_warning, render_views, write_model
@@ -177,6 +177,7 @@ def _train(args: argparse.Namespace) -> int:
         job = replace(job, backend=extension.preferences().backend)
     _empty_file()
     root = _import_for(job)
+    photographs.look_at_scene(bpy.context, root)
     job_settings.apply_job(root.lodgs.training, job)  # for the panel when the .blend is opened
     if args.interrupted():
         raise KeyboardInterrupt
@@ -229,6 +230,7 @@ def _import(args: argparse.Namespace) -> int:
         root = _import_photos(args.source.resolve())
     else:
         root = importing.import_splats(bpy.context, args.source.resolve(), warn=_warn)
+    photographs.look_at_scene(bpy.context, root)
     _print(f"'{root.name}': {scenes.contents(root)}")
     _save(args.blend)
     return DONE

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.blender.fake_trainer import COUNTS, splats
+from training.scenes.colmap import read_scene
 
 pytestmark = pytest.mark.one_blender
 
@@ -54,6 +55,7 @@ def test_train_saves_and_exports(bpy, lodgs, lodgs_command, fake, tmp_path, capf
     (root,) = [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     assert {i.number: len(i.object.data.points) for i in root.lodgs.levels} == COUNTS
     assert [obj for obj in root.children_recursive if obj.type == "CAMERA"]
+    assert_viewports_show_the_central_photo(bpy)
 
     second = tmp_path / "again.ply"
     assert lodgs_command("export", blend, second) == 0
@@ -223,6 +225,20 @@ def test_import_writes_a_blend_file(bpy, lodgs_command, tmp_path):
     assert [obj for obj in bpy.data.objects if obj.lodgs.is_root]
     scene = bpy.context.scene  # renders show the colours of the photos
     assert (scene.render.engine, scene.view_settings.view_transform) == ("LODGS", "Standard")
+    assert_viewports_show_the_central_photo(bpy)
+
+
+def assert_viewports_show_the_central_photo(bpy):
+    scene = read_scene(SCENE)
+    central = min(scene.cameras, key=lambda camera: float(np.linalg.norm(camera.center - scene.center)))
+    view = bpy.data.objects[central.name].matrix_world
+    regions = [area.spaces.active.region_3d for area in bpy.context.screen.areas if area.type == "VIEW_3D"]
+    assert regions
+    for region in regions:
+        backward = region.view_rotation.to_matrix().col[2]
+        position = region.view_location + region.view_distance * backward
+        np.testing.assert_allclose(position, view.translation, atol=1e-4)
+        np.testing.assert_allclose(backward, view.col[2][:3], atol=1e-4)
 
 
 COMMAND = """
