@@ -293,8 +293,7 @@ def place_splats(
                 _add_views(context, root, cameras, camera_extent(cameras) or 1.0, near)
                 for settings in (view.data.lodgs for view in views(root)):
                     settings.held_out = cameras[settings.model_index].name in held_out
-            if viewpoints.has_cameras(context.scene, root):
-                root.lodgs.training.views_from = "CAMERAS"  # those that the artist uses
+            _choose_views(context, root)
             root.lodgs.training.method = next(
                 info.name for info in METHODS.values() if info.suggested_for_base
             )
@@ -304,6 +303,19 @@ def place_splats(
     if bundle.rule and not root.lodgs.by_distance:
         warn(" ".join(unknown_rule_error(bundle.rule)))
     return root
+
+
+def _choose_views(context: bpy.types.Context, root: bpy.types.Object) -> None:
+    """Let trainings use the artist's views: cameras, else a selected curve, else an animated scene camera."""
+    settings, camera = root.lodgs.training, context.scene.camera
+    animation = camera.animation_data if camera is not None else None
+    curve = next((obj for obj in context.selected_objects if obj.type == "CURVE"), None)
+    if viewpoints.has_cameras(context.scene, root):
+        settings.views_from = "CAMERAS"
+    elif curve is not None:
+        settings.views_from, settings.curve = "CURVE", curve
+    elif animation is not None and animation.action is not None:
+        settings.views_from = "ANIMATION"
 
 
 def refill(root: bpy.types.Object, file: SplatsFile) -> None:

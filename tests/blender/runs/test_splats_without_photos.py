@@ -120,6 +120,20 @@ def test_imported_splats_use_cameras_but_not_those_of_other_scenes(bpy, root, tm
         assert bpy.context.active_object.lodgs.training.views_from == expected
 
 
+def test_imported_splats_use_an_animated_camera_or_a_selected_curve(bpy, root, tmp_path):
+    camera = bpy.context.scene.camera = new_camera(bpy, (0, -9, 4))
+    for frame in (1, 41):
+        camera.location.x = frame
+        camera.keyframe_insert("location", frame=frame)
+    bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "ball.ply"))
+    assert bpy.context.active_object.lodgs.training.views_from == "ANIMATION"
+    bpy.ops.curve.primitive_bezier_circle_add(radius=6)
+    curve = bpy.context.object
+    bpy.ops.lodgs.import_splats(filepath=str(tmp_path / "ball.ply"))
+    training = bpy.context.active_object.lodgs.training
+    assert (training.views_from, training.curve) == ("CURVE", curve)
+
+
 def test_views_match_an_animated_camera(bpy, fake, root, tmp_path):
     fake()
     camera = bpy.context.scene.camera = new_camera(bpy, (0, -9, 4))
