@@ -1,6 +1,6 @@
 """``make demo``: the main workflow on the example scene, from photos to levels, in Blender's Python.
 
-Imports the scene, trains levels in a background process, saves a .blend file with selection by distance,
+Imports the scene, trains levels in a background process, saves a .blend file with all levels,
 exports the bundle, measures held-out views and compares the levels. Output folder: ``build/demo``.
 """
 
