@@ -54,7 +54,7 @@ def same(first: Splats, second: Splats) -> bool:
 
 @pytest.fixture(scope="module")
 def base(data) -> Splats:
-    values = {"steps": 12, "margin": 0.0, "far_share": 0.0}
+    values = {"steps": 12, "margin": 0.0, "far_share": 0.0, "lr_final": 1.0}
     plain = create("3dgs", data, override(method_info("3dgs").preset("draft"), values), 0, "cpu")
     return trained(plain)[-1].splats
 

@@ -164,7 +164,7 @@ def test_training_starts_with_splats_between_points(data, name, monkeypatch):
     between = np.array([[0.25] * 3, [0.5] * 3, [0.75] * 3], np.float32)
     limits = []
 
-    def points_between(scene, cameras, limit, seed):
+    def points_between(scene, cameras, limit, seed, region):
         limits.append(limit)
         return between, np.full((3, 3), 128, np.uint8)
 
