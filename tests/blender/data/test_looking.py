@@ -239,7 +239,7 @@ def test_out_of_memory_leaves_no_data(bpy, lodgs, monkeypatch, tmp_path, operati
 
     def write_or_fail(*arguments):
         written.append(arguments)
-        if len(written) >= min(fails_at, 3 if operation == "colmap" else fails_at):
+        if len(written) >= min(fails_at, 2 if operation == "colmap" else fails_at):
             raise MemoryError
         write(*arguments)
 
