@@ -67,7 +67,7 @@ def main() -> int:
         return code
     print(f"Finished in {time.monotonic() - started:.0f} seconds. Files in {os.path.relpath(out)}:")
     print("  index.html   compare the levels in a browser: open this next")
-    print("  scene.blend  the scene in Blender, with levels by distance")
+    print("  scene.blend  the scene in Blender, with all levels")
     print("  bundle.ply   all levels in one file, which ordinary viewers open at the finest")
     if (out / "page").exists():
         print("  page         all levels for any browser, to upload; python -m http.server shows it here")
