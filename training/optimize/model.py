@@ -341,7 +341,12 @@ def splat_rates(parameters: Parameters, extent: float) -> dict[str, LearningRate
 
 
 def rates_at(parameters: DensityParameters, extent: float, step: int, steps: int) -> dict[str, LearningRate]:
-    """Return the learning rates of NAMES at a step of ``steps``, by the schedules of a method."""
+    """Return the learning rates of NAMES at a step of a level, by the schedules of a method.
+
+    Args:
+        extent: scene extent, the unit of the rates of positions.
+        step, steps: completed steps of the level, and all of them.
+    """
     p = parameters
     factor = annealing(step / steps, p.lr_final)
     rates = {name: rate * factor for name, rate in splat_rates(p, extent).items()}
