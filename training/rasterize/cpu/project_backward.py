@@ -290,16 +290,12 @@ def step_harmonics(i, trained, gradient, step):
 def step_range(begin, end, index, width, gradient, step):
     """Make an Adam step of the rows ``index[begin:end]`` of ``width`` numbers, with gradients by range."""
     values, m, v, rates, keep_m, keep_v, scale_v, eps = step
-    count, first = end - begin, index[begin]
-    if index[end - 1] - first == count - 1:  # neighbours in memory, in whole vectors
-        count *= width
-        adam_values(values, first * width, count, gradient, 0, m, v, rates, keep_m, keep_v, scale_v, eps)
-        return
-    for k in range(count):
-        first = index[begin + k] * width
-        adam_values(
-            values, first, width, gradient, k * width, m, v, rates, keep_m, keep_v, scale_v, eps
-        )  # fmt: skip
+    rows, length = end - begin, width
+    if index[end - 1] - index[begin] == rows - 1:  # neighbours in memory: one row, in whole vectors
+        rows, length = 1, rows * width
+    for k in range(rows):
+        start = index[begin + k] * width
+        adam_values(values, start, length, gradient, k * length, m, v, rates, keep_m, keep_v, scale_v, eps)
 
 
 @kernel(FAST)
@@ -350,9 +346,8 @@ def project_backward(
             grad2d[i, 0], grad2d[i, 1] = ZERO, ZERO
             if steps is None:
                 by_sh[i] = ZERO
-            elif not sparse_sh:
+            else:
                 flat_coefficients[:trained] = ZERO
-                step_harmonics(i, trained, flat_coefficients, steps[4])
         else:
             add_pairs(first_pair[s], pair_count[s], pair_row, pair_sums, sums)
             read_lane(block, lanes, i, means, quats, log_scales, opacity_logits, antialias)
@@ -384,9 +379,10 @@ def project_backward(
                 by_sh[i, active:] = ZERO
             else:
                 set_coefficients(by_coefficients, active, basis, red, green, blue)
-                step_harmonics(i, trained, flat_coefficients, steps[4])
             places[lanes] = place
             lanes += 1
+        if steps is not None and (pair_count[s] > 0 or not sparse_sh):
+            step_harmonics(i, trained, flat_coefficients, steps[4])
         if lanes < WIDTH and s + 1 < end:
             continue
         differentiate_block(
