@@ -34,7 +34,7 @@ from .margins import MarginGenerator
 from .model import Model, select_rows
 from .parameters import Parameters
 from .schedules import ShSchedule, due
-from .support import PRUNE_INTERVAL, SupportPruning
+from .support import PRUNE_INTERVAL, SETTLED_INTERVAL, SupportPruning
 from .training_data import TrainingData, TrainingView
 
 
@@ -300,13 +300,16 @@ class Method(ABC, Generic[P, D]):
         """Return True if :meth:`control_density` uses the statistics of a step."""
         return True
 
-    def prune_unsupported(self, step: int) -> None:
+    def prune_unsupported(self, step: int, turn: int) -> None:
         """Remove splats in free space, at intervals and at the ends of levels.
+
+        Args:
+            turn: see :meth:`SupportPruning.prune`.
 
         Raises:
             LodgsError: no splats remain.
         """
-        self.support.prune(self.model, step)
+        self.support.prune(self.model, step, turn)
 
     # -- checkpoints, to override ----------------------------------------------------------------------
 
@@ -331,9 +334,10 @@ class Method(ABC, Generic[P, D]):
         view = self.choose_view(step)
         result = self._step_without_autograd(view, step) or self._step_with_autograd(view, step)
         self.control_density(step)
-        if due(PRUNE_INTERVAL, step + 1) or self.ends_level(step):
+        interval = PRUNE_INTERVAL if self.collects_stats(view, step) else SETTLED_INTERVAL
+        if due(interval, step + 1) or self.ends_level(step):
             self.exposure.center()
-            self.prune_unsupported(step)
+            self.prune_unsupported(step, step // interval)
         return result
 
     def choose_view(self, step: int) -> TrainingView:

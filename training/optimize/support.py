@@ -20,8 +20,8 @@ from .observed_depths import photo_parts
 
 NEIGHBORS = (1, 2, 4)
 """Ranks of the neighbours of a camera to form midpoints with."""
-PRUNE_INTERVAL = 50
-"""Steps between two removals of unsupported splats."""
+PRUNE_INTERVAL, SETTLED_INTERVAL = 50, 200
+"""Steps between two removals of unsupported splats, during density control and after it."""
 NEAREST_QUANTILE = 0.01
 """Quantile of point depths used as a view's nearest depth, which ignores outliers."""
 MARGIN = 0.1
@@ -196,8 +196,11 @@ class SupportPruning:
         return ObservedSpace(self._scene, self._cameras)
 
     @torch.no_grad()
-    def prune(self, model: Model, step: int) -> None:
+    def prune(self, model: Model, step: int, turn: int) -> None:
         """Remove splats near training views or far in front of observed points, and limit the others' size.
+
+        Args:
+            turn: see :meth:`ObservedSpace.find_intruding`.
 
         Raises:
             LodgsError: no splats remain.
@@ -212,6 +215,6 @@ class SupportPruning:
         if self._free_depth:
             intruding = self._support.find_intruding(means, distances, positions, self._free_depth)
             if self._use_observations:
-                intruding |= self._observed_space.find_intruding(means, step // PRUNE_INTERVAL)
+                intruding |= self._observed_space.find_intruding(means, turn)
             model.keep(torch.from_numpy(~intruding))
             require_rows(model, step, "free_depth")

@@ -124,7 +124,7 @@ def test_support_pruning_on_device_equals_host(graphics, data):
     first, second = trained(1000), trained(1000)
     second.adam.zero_grad()  # copies it to the host
     for model in (first, second):
-        SupportPruning(data.scene, data.train, free_depth=0.5, largest=0.01).prune(model, 0)
+        SupportPruning(data.scene, data.train, free_depth=0.5, largest=0.01).prune(model, 0, 0)
     assert first._device_model is not None and second._device_model is None and 0 < len(first) < 1000
     for tensors in zip(_flat(first.state_dict()), _flat(second.state_dict()), strict=True):
         assert torch.equal(*tensors)

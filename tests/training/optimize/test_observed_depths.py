@@ -179,5 +179,5 @@ def test_pruning_uses_observations_unless_disabled(use_observations):
     }
     model = Model(row, dict.fromkeys(row, 0.01))
     scene = scene_of(plane())
-    SupportPruning(scene, [camera("a"), camera("b")], 0.5, 0.0, use_observations).prune(model, 0)
+    SupportPruning(scene, [camera("a"), camera("b")], 0.5, 0.0, use_observations).prune(model, 0, 0)
     assert model["means"][:, 2].tolist() == ([9] if use_observations else [6, 9])

@@ -1,5 +1,7 @@
 """Tests of the free space around cameras and the size limit of splats, computed by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -91,9 +93,23 @@ def test_training_removes_intruding_splats_and_limits_sizes(data):
     rows["means"][0] = in_front
     rows["log_scales"][1] = 9.0
     method.model.append(rows)
-    method.prune_unsupported(0)
+    method.prune_unsupported(0, 0)
     assert len(method.model) == count + 1
     largest = method.model["log_scales"].detach().exp().amax(1).numpy()
     support = Support(data.train, data.scene.points)
     allowed = p.largest * support.nearest_positions(method.model["means"].detach().numpy())[0]
     assert (largest <= allowed * 1.0001).all() and largest[-1] == pytest.approx(allowed[-1], rel=1e-4)
+
+
+def test_support_is_tested_less_often_after_density_control(data, monkeypatch):
+    from training.methods import METHODS, create
+
+    draft = replace(METHODS["3dgs"].presets["draft"], steps=800, densify_until=0.25)
+    method = create("3dgs", data, draft, 0, "cpu")
+    monkeypatch.setattr(method, "_step_without_autograd", lambda view, step: True)
+    monkeypatch.setattr(method, "control_density", lambda step: None)
+    calls = []
+    monkeypatch.setattr(method, "prune_unsupported", lambda step, turn: calls.append((step + 1, turn)))
+    for step in range(800):
+        method.train_step(step)
+    assert calls == [(50, 0), (100, 1), (150, 2), (200, 3), (400, 1), (600, 2), (800, 3)]

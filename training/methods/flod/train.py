@@ -246,8 +246,8 @@ class Method(method.Method[FlodParameters, Drawing]):
             return 0.0
         return self.parameters.densify_until[self.stages.level_at(step) - 1] * self.stages.steps_at(step)
 
-    def prune_unsupported(self, step: int) -> None:
-        super().prune_unsupported(step)
+    def prune_unsupported(self, step: int, turn: int) -> None:
+        super().prune_unsupported(step, turn)
         if self.is_finishing(step):  # minimum sizes take precedence
             self._raise_to_min_sizes()
 
