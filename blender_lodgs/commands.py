@@ -31,6 +31,7 @@ from ..training.splats.origin import describe_origin
 from . import extension
 from .data import importing, photographs, scenes, viewpoints
 from .data.paths import save_file
+from .data.view_settings import VIEW_PATTERNS, ViewPattern
 from .render import engine
 from .render.capture import noise_warning, render_views, write_model
 from .render.video import MAX_FRAMES, extract_frames
@@ -129,6 +130,11 @@ def _add_export(commands: _Commands) -> None:
     export.add_argument("--as-trained", dest="looked", action="store_false", help="ignore the scene's look")
 
 
+def _view_patterns() -> list[ViewPattern]:
+    """Return the patterns of views that work without viewports."""
+    return [pattern for pattern in VIEW_PATTERNS if pattern.option]
+
+
 def _add_capture(commands: _Commands) -> None:
     capture = commands.add_parser(
         "capture",
@@ -141,7 +147,7 @@ def _add_capture(commands: _Commands) -> None:
     capture.add_argument("blend", type=Path, help=".blend file")
     capture.add_argument("--out", type=Path, required=True, help="folder for the COLMAP scene")
     source = capture.add_mutually_exclusive_group()
-    for pattern in viewpoints.VIEW_PATTERNS:
+    for pattern in _view_patterns():
         about = pattern.about[0].lower() + pattern.about[1:]
         kind = {"metavar": "NAME"} if pattern.option == "curve" else {"action": "store_true"}
         source.add_argument(f"--{pattern.option}", help=about, **kind)
@@ -265,7 +271,7 @@ def _capture(args: argparse.Namespace) -> int:
     _open(args.blend)
     scene = bpy.context.scene
     settings = scene.lodgs_capture
-    for pattern in viewpoints.VIEW_PATTERNS:
+    for pattern in _view_patterns():
         if getattr(args, pattern.option):
             settings.views_from = pattern.identifier
     if args.curve:

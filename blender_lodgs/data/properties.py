@@ -10,7 +10,7 @@ from .. import compat
 from .property_callbacks import look_up, tag_owner
 from .scene_properties import CONTROLS, SplatLevel, SplatScene, SplatSource, SplatStream, SplatTable
 from .training_settings import PARAMETERS, TrainingCell, TrainingSettings
-from .viewpoints import ViewsSettings
+from .view_settings import ViewsSettings
 
 _redraw = look_up("redraw")
 _ellipsoids_changed = look_up("ellipsoids")

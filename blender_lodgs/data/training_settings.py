@@ -13,6 +13,7 @@ from ...training.settings import label_of
 from ...training.splats.levels import MAX_LEVELS
 from . import crops, photographs, viewpoints
 from .setting_properties import property_of
+from .view_settings import ViewsSettings
 
 PANEL_KEYS = {name: f for name, f in KEYS.items() if f.metadata.get("panel")}
 """Job keys that are stored as settings of a scene root."""
@@ -132,7 +133,7 @@ class TrainingCell(bpy.types.PropertyGroup):
     )
 
 
-class TrainingSettings(viewpoints.ViewsSettings, bpy.types.PropertyGroup):
+class TrainingSettings(ViewsSettings, bpy.types.PropertyGroup):
     """Settings of the Training panel and the newest run of a scene root (``root.lodgs.training``).
 
     Job keys that are declared with a panel (PANEL_KEYS) have a property of the same name.

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
 from ...training.errors import LodgsError
-from ...training.runs.job import KEYS, MIN_VIEWS
-from ...training.scenes.cameras import Camera
+from ...training.runs.job import MIN_VIEWS
+from ...training.scenes.cameras import Camera, pick_evenly
 from ...training.scenes.viewpoints import (
     DOMES,
     NEAR_SHARE,
@@ -26,11 +26,10 @@ from ...training.scenes.viewpoints import (
 )
 from ...training.splats.gaussians import Splats
 from .. import attributes
-from . import changes
+from . import changes, visited
 from .cameras import enabled_cameras, scene_camera, supported_views, view_from, view_of, views_of_cameras
 from .objects import root_of
 from .placement import matrix_of
-from .setting_properties import property_of
 
 SAMPLE = 100_000
 """Approximate number of splats for the preview of a dome."""
@@ -56,88 +55,6 @@ def _ignore(message: str) -> None:
     """Ignore a warning, in previews."""
 
 
-def _is_curve(settings: bpy.types.PropertyGroup, obj: bpy.types.Object) -> bool:
-    return obj.type == "CURVE"
-
-
-class ViewPattern(NamedTuple):
-    """A pattern of the cameras that render training images.
-
-    Attributes:
-        identifier, label, about: entry of the enum ``ViewsSettings.views_from``.
-        option: name of its option on the command line.
-        setting: property of ``ViewsSettings`` for this pattern only, or "".
-    """
-
-    identifier: str
-    label: str
-    about: str
-    option: str
-    setting: str = ""
-
-
-VIEW_PATTERNS = (
-    ViewPattern(
-        "DOME",
-        "All Around",
-        "Dome of cameras around the splats or the selected objects. For splats, half of the cameras are "
-        "close to their surface",
-        "around",
-    ),
-    ViewPattern(
-        "GRID",
-        "Above",
-        "Grid of cameras above the splats or the selected objects that look down and to four sides, "
-        "as a drone does, for terrain and towns",
-        "above",
-        setting="height",
-    ),
-    ViewPattern("CAMERAS", "Cameras", "Cameras enabled in renders, without other splat scenes", "cameras"),
-    ViewPattern(
-        "ANIMATION", "Animation", "Scene camera at frames spread evenly over the frame range", "animation"
-    ),
-    ViewPattern(
-        "CURVE",
-        "Along Curve",
-        "Cameras along a curve that look ahead, to both sides and back in turn",
-        "curve",
-        setting="curve",
-    ),
-)
-
-
-class ViewsSettings:
-    """Settings of views for rendering training images, of splats or of a Blender scene."""
-
-    views_from: bpy.props.EnumProperty(
-        name="Views From",
-        description="Placement of the cameras that render training images",
-        items=[(pattern.identifier, pattern.label, pattern.about) for pattern in VIEW_PATTERNS],
-    )
-    views: property_of(KEYS["views"])
-    show_views: bpy.props.BoolProperty(
-        name="Show Views",
-        description="Show the views in the viewport",
-        default=False,
-        options=set(),
-    )
-    view_width: property_of(KEYS["view_width"])
-    height: bpy.props.FloatProperty(
-        name="Height",
-        description="Height of the views above the top of the subject. 0 uses twice their spacing",
-        default=0.0,
-        min=0.0,
-        soft_max=1000.0,
-        subtype="DISTANCE",
-    )
-    curve: bpy.props.PointerProperty(
-        name="Curve",
-        description="Curve for the cameras to follow, at eye level",
-        type=bpy.types.Object,
-        poll=_is_curve,
-    )
-
-
 def has_only_splats(root: bpy.types.Object) -> bool:
     """Return True if a splat scene has splats but no photos."""
     return not root.lodgs.scene_folder and bool(root.lodgs.existing_levels)
@@ -145,6 +62,8 @@ def has_only_splats(root: bpy.types.Object) -> bool:
 
 def view_count(settings: bpy.types.PropertyGroup) -> int:
     """Return the number of views of the settings."""
+    if settings.views_from == "VISITED":
+        return min(settings.views, visited.count(bpy.context.scene))
     if settings.views_from != "CAMERAS":
         return settings.views
     return _count(enabled_cameras(bpy.context.scene, settings.id_data))
@@ -188,6 +107,10 @@ def training_views(
         case "GRID":
             views, near = _aerial_views(root, opaque_means(splats), settings, width, height)
             return [(view, near) for view in views]
+        case "VISITED":
+            visits, near = _visited_views(context.scene, settings.views, width, height)
+            local_views, units = _in_root(visits, root)
+            return [(view, near / units) for view in local_views]
     return []
 
 
@@ -256,6 +179,8 @@ def placed_capture_views(
             spacing = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()) / settings.views
             views = views_along(points, np.array(UP), settings.views, width, height)
             return views, min(CLIP_START, spacing / 4)
+        case "VISITED":
+            return _visited_views(context.scene, settings.views, width, height)
     return [], 0.0
 
 
@@ -266,6 +191,8 @@ def capture_view_count(scene: bpy.types.Scene) -> int:
             return _count(obj for obj in enabled_cameras(scene) if root_of(obj) is None)
         case "ANIMATION":
             return len(_frames(scene, scene.lodgs_capture.views))
+        case "VISITED":
+            return min(scene.lodgs_capture.views, visited.count(scene))
     return scene.lodgs_capture.views
 
 
@@ -340,6 +267,8 @@ def preview_views(root: bpy.types.Object) -> list[Camera]:
             world_to_root = np.linalg.inv(matrix_of(root))
             points = _curve_points(settings.curve) @ world_to_root[:3, :3].T + world_to_root[:3, 3]
             return views_along(points, world_to_root[:3, 2], settings.views, 3, 2)
+        case "VISITED":
+            return _in_root(_visited_views(bpy.context.scene, settings.views)[0], root)[0]
     return []
 
 
@@ -388,8 +317,32 @@ def _aerial_views(
     views, near = aerial_views(
         points @ matrix[:3, :3].T + matrix[:3, 3], settings.views, width, height, settings.height
     )
-    local_views, units = zip(*[view.in_object_space(matrix) for view in views], strict=True)
-    return list(local_views), near / units[0]
+    local_views, units = _in_root(views, root)
+    return local_views, near / units
+
+
+def _visited_views(
+    scene: bpy.types.Scene, count: int, width: int = 3, height: int = 2
+) -> tuple[list[Camera], float]:
+    """Return up to ``count`` views where viewports rested, and their least near depth, in Blender's world.
+
+    Raises:
+        LodgsError: there are fewer than two.
+    """
+    visits = visited.visited_views(scene, width, height)
+    if len(visits) < MIN_VIEWS:
+        raise LodgsError(
+            f"Cannot place views: viewports rested in {len(visits)} view(s), but two are needed.",
+            "Look around in a viewport, or choose other views.",
+        )
+    views, nears = zip(*pick_evenly(visits, count), strict=True)
+    return list(views), min(nears)
+
+
+def _in_root(views: Iterable[Camera], root: bpy.types.Object) -> tuple[list[Camera], float]:
+    """Return views of Blender's world in a root's coordinates, and the number of world units per unit."""
+    local_views, units = zip(*[view.in_object_space(matrix_of(root)) for view in views], strict=True)
+    return list(local_views), units[0]
 
 
 def _cached(kind: str, key: tuple, create: Callable[[], Any]) -> Any:

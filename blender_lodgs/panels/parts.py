@@ -9,7 +9,7 @@ import bpy
 
 from ..data import roots
 from ..data.placement import axes_of
-from ..data.viewpoints import VIEW_PATTERNS, ViewsSettings
+from ..data.view_settings import VIEW_PATTERNS, ViewsSettings
 from ..runs import environment_setup
 
 TINT_ICONS = {
@@ -73,7 +73,7 @@ def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) 
     """Draw the settings of the views to render as training images.
 
     Args:
-        count: number of cameras.
+        count: number of cameras or visited views.
     """
     column.prop(settings, "views_from")
     for pattern in VIEW_PATTERNS:
@@ -83,6 +83,8 @@ def draw_views(column: bpy.types.UILayout, settings: ViewsSettings, count: int) 
         column.label(text=f"{count} camera{'' if count == 1 else 's'}")
     else:
         column.prop(settings, "views")
+    if settings.views_from == "VISITED":
+        column.label(text=f"{count} visited view{'' if count == 1 else 's'}")
     column.prop(settings, "view_width")
     if settings.views_from not in ("CAMERAS", "ANIMATION"):  # Blender draws those cameras itself
         column.prop(settings, "show_views")

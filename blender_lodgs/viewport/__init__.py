@@ -22,7 +22,7 @@ import bpy
 
 from ...training.splats.level_colors import level_color
 from .. import extension
-from ..data import roots
+from ..data import roots, visited
 from . import cells, coverage, discs, frusta, shaders, sources, splats, view_camera, views
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ def _draw_view(context: bpy.types.Context) -> None:
     with_splats = draws_splats(context.scene, space)
     _follow_shading(context.scene)
     view_camera.track(region, context.scene, view, splats=with_splats)
+    visited.track(region, context.scene, view)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
         points = [
             (obj, tint)
@@ -130,6 +131,7 @@ def _on_file(*_) -> None:
 def _on_load(*_) -> None:
     _on_undo()
     views.clear()
+    visited.clear()
 
 
 @bpy.app.handlers.persistent
