@@ -152,8 +152,8 @@ def loaded() -> Generator[float, None, None]:
 
     def is_loaded() -> bool:
         states = views._views.values()
-        return bool(states) and not any(
-            view.pending or view.loading or view.resolution < 1 for view in states
+        return bool(states) and all(
+            view.count and not (view.pending or view.loading or view.resolution < 1) for view in states
         )
 
     yield 0.5
