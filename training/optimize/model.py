@@ -17,6 +17,7 @@ from ..rasterize import Adam, DeviceModel, Gaussians, Rendering, StepModel, make
 from ..rasterize.adam import LearningRate
 from ..rasterize.stats import PEAK_STATS, accumulate_stats
 from ..splats.gaussians import Splats
+from ..splats.morton import spatial_order
 from .parameters import DensityParameters, Parameters
 from .schedules import annealing, log_linear
 
@@ -139,12 +140,19 @@ class Model:
         rows = {name: self._adam.tensors[name].detach()[index] for name in self._host_tensors}
         return rows if self._device_model is None else rows | self._device_model.read_rows(index)
 
-    @torch.no_grad()
     def keep(self, mask: torch.Tensor) -> None:
         """Remove the rows where ``mask`` (N,), on any device, is False."""
-        if mask.all():
-            return
-        rows = torch.nonzero(mask.to(self._adam.tensors["means"].device)).squeeze(1)
+        if not mask.all():
+            self._select(torch.nonzero(mask).squeeze(1))
+
+    def sort(self) -> None:
+        """Sort the rows by space: steps then read and write neighbours in memory."""
+        self._select(torch.from_numpy(spatial_order(self.read("means").cpu().numpy())))
+
+    @torch.no_grad()
+    def _select(self, rows: torch.Tensor) -> None:
+        """Keep only rows (M,) int64, in this order."""
+        rows = rows.to(self._adam.tensors["means"].device)
         if not len(rows):
             self._copy_to_host()
         if self._device_model is not None:

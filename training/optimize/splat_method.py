@@ -130,9 +130,10 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         require_rows(self.model, step, "least_weight")
 
     def add_margins(self, step: int) -> None:
-        """Add margins if due: when densification ends."""
+        """Add margins if due: when densification ends. The number of splats then remains almost the same."""
         if step < self._densify_until <= step + 1:
             self.model.append(self.margin_rows())
+            self.model.sort()
 
     def margin_rows(self) -> dict[str, torch.Tensor]:
         """Create margin splats within the budget, as rows of the model."""

@@ -24,6 +24,20 @@ def test_keep_drops_rows_and_their_moments(model, moments):
         assert model[name].requires_grad and model[name].is_leaf
 
 
+def test_sorted_rows_follow_a_curve_with_their_moments(model, moments):
+    """Along the diagonal, a Z-order curve has the order of the coordinates."""
+    places = torch.randperm(50, generator=torch.Generator().manual_seed(0))
+    model.assign("means", places.float()[:, None].repeat(1, 3))
+    level, decay = model.columns["level"].clone(), model["decay"].detach().clone()
+    model.sort()
+    rows = torch.argsort(places)
+    assert model["means"][:, 0].tolist() == list(range(50))
+    assert torch.equal(model.columns["level"], level[rows])
+    assert torch.equal(model["decay"], decay[rows])
+    for order in (0, 1):
+        assert torch.equal(moments(model, "decay", order), 10**order * (rows + 1.0))
+
+
 def test_append_adds_trained_tensors_and_zeros_for_missing_columns(model, moments):
     rows = model.read_rows(torch.tensor([3, 3, 7]))
     model.stats["seen"] += 5

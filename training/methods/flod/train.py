@@ -223,13 +223,14 @@ class Method(method.Method[FlodParameters, Drawing]):
             )
 
     def _add_margins(self, level: int) -> None:
-        """Add margins to a level."""
+        """Add margins to a level, whose number of splats then remains almost the same."""
         s_min = self._constraint(level)
         log_scales = (self.model["log_scales"].detach().exp() + s_min).log()
         gaussians = replace(self.model.gaussians, log_scales=log_scales)
         rows = vars(self.margins.extend(gaussians, self.parameters.margin_room(self.budget(level))))
         log_scales = constrained_log_scales(rows["log_scales"].exp(), s_min)
         self.model.append({**rows, "log_scales": log_scales})
+        self.model.sort()
 
     def _finishing_values(self, step: int) -> Values:
         """Return the rule's controls for a finishing step."""
