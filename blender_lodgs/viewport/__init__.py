@@ -63,14 +63,10 @@ def _draw_view(context: bpy.types.Context) -> None:
     view_camera.track(region, context.scene, view, splats=with_splats)
     visited.track(region, context.scene, view)
     if space.shading.type == "SOLID" and space.shading.color_type not in {"OBJECT", "RANDOM", "SINGLE"}:
-        points = [
-            (obj, tint)
-            for root in roots.roots(context.scene)
-            for obj, tint in _points(root.lodgs, not with_splats and not context.scene.lodgs_viewport.native)
-            if obj is not None and obj.visible_get(view_layer=context.view_layer, viewport=space)
-        ]
+        depsgraph = context.evaluated_depsgraph_get()
+        levels = not with_splats and not context.scene.lodgs_viewport.native
+        points = visible_points(depsgraph, space, levels)
         if points:
-            depsgraph = context.evaluated_depsgraph_get()
             discs.draw(points, depsgraph, view.view_matrix, view.window_matrix, region.height)
     if with_splats:
         views.draw(context)
@@ -103,6 +99,27 @@ def _store_shading() -> None:
         wireframe = _shows_wireframe(scene)
         if scene.lodgs_viewport.all_points != wireframe:
             scene.lodgs_viewport.all_points = wireframe
+
+
+def visible_points(
+    depsgraph: bpy.types.Depsgraph, viewport: bpy.types.SpaceView3D, levels: bool
+) -> list[discs.Points]:
+    """Return the points that a viewport shows, also those of collection instances.
+
+    Args:
+        levels: include the splats of levels.
+    """
+    visible = []
+    for instance in depsgraph.object_instances:  # visible ones only
+        if instance.object.type != "POINTCLOUD":
+            continue
+        obj = instance.object.original
+        shown_by = (instance.parent if instance.is_instance else instance.object).original
+        root = roots.root_of(obj)
+        tints = {} if root is None else dict(_points(root.lodgs, levels))
+        if obj in tints and shown_by.visible_in_viewport_get(viewport):
+            visible.append((obj, instance.matrix_world.copy(), tints[obj]))
+    return visible
 
 
 def _points(

@@ -14,6 +14,8 @@ from mathutils import Matrix, Vector
 from .. import attributes
 
 Color = tuple[float, float, float, float]
+Points = tuple[bpy.types.Object, Matrix, Color]
+"""Point cloud, its transform in the world, and its tint (sRGB); alpha 0 keeps the points' own colours."""
 
 _VERTEX = """
 void main()
@@ -44,7 +46,7 @@ _batches: dict[int, gpu.types.GPUBatch] = {}
 
 
 def draw(
-    objects: list[tuple[bpy.types.Object, Color]],
+    clouds: list[Points],
     depsgraph: bpy.types.Depsgraph,
     view: Matrix,
     projection: Matrix,
@@ -53,7 +55,7 @@ def draw(
     """Draw evaluated point clouds into the active framebuffer, tested against its depth.
 
     Args:
-        objects: point clouds with their tints (sRGB); alpha 0 keeps the points' own colours.
+        clouds: point clouds or instances of them.
         view, projection: matrices from the world to camera space, and from there to clip space.
         height: height of the framebuffer in pixels.
     """
@@ -62,12 +64,12 @@ def draw(
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(True)
     gpu.state.program_point_size_set(True)
-    for obj, tint in objects:
+    for obj, matrix, tint in clouds:
         batch = _batches.get(obj.session_uid)
         if batch is None:
             batch = _batches[obj.session_uid] = _upload(obj.evaluated_get(depsgraph).data)
-        scale = obj.matrix_world.median_scale
-        shader.uniform_float("model_view_projection", projection @ view @ obj.matrix_world)
+        scale = matrix.median_scale
+        shader.uniform_float("model_view_projection", projection @ view @ matrix)
         shader.uniform_float("toward", projection @ Vector((0, 0, scale, 0)))
         shader.uniform_float("tint", tint)
         shader.uniform_float("pixels", abs(projection[1][1]) * scale * height)

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from training.splats.gaussians import Splats
+from training.splats.levels import Level
+
 SIZE = 64
 WHITE, RED, GREEN = (255, 255, 255), (255, 0, 0), (0, 255, 0)
 
@@ -26,9 +29,13 @@ def _points(bpy, lodgs, positions, colors, radius):
     return obj
 
 
+def _placed(obj, tint=(0, 0, 0, 0)):
+    return [(obj, obj.matrix_world, tint)]
+
+
 def test_discs_match_colour_position_and_size(bpy, lodgs, draw_points):
     obj = _points(bpy, lodgs, [(-0.5, 0.5, 0), (0.5, -0.5, 0)], [RED, (0, 0, 188)], 0.25)
-    image = draw_points([(obj, (0, 0, 0, 0))])
+    image = draw_points(_placed(obj))
     y, x = (np.mgrid[:SIZE, :SIZE] + 0.5) * 2 / SIZE - 1
     red, blue = (np.hypot(x - a, y - b) for a, b in ((-0.5, 0.5), (0.5, -0.5)))
     pixel = 2 / SIZE
@@ -40,17 +47,47 @@ def test_discs_match_colour_position_and_size(bpy, lodgs, draw_points):
 def test_nearer_points_occlude_and_changes_are_drawn(bpy, lodgs, draw_points):
     obj = _points(bpy, lodgs, [(0, 0, 1), (0, 0, 0)], [RED, GREEN], 0.3)
     middle = SIZE // 2
-    assert tuple(draw_points([(obj, (0, 0, 0, 0))])[middle, middle]) == (1, 0, 0, 1)
+    assert tuple(draw_points(_placed(obj))[middle, middle]) == (1, 0, 0, 1)
     obj.data.attributes["position"].data.foreach_set("vector", np.float32([0, 0, 0, 0, 0, 1]))
     obj.data.update_tag()
     bpy.context.view_layer.update()
-    assert tuple(draw_points([(obj, (0, 0, 0, 0))])[middle, middle]) == (0, 1, 0, 1)
+    assert tuple(draw_points(_placed(obj))[middle, middle]) == (0, 1, 0, 1)
     obj.location.x = 0.7  # moves without a new upload
     bpy.context.view_layer.update()
-    assert draw_points([(obj, (0, 0, 0, 0))])[middle, middle, 3] == 0
+    assert draw_points(_placed(obj))[middle, middle, 3] == 0
 
 
 def test_tints_colour_points(bpy, lodgs, draw_points):
     obj = _points(bpy, lodgs, [(0, 0, 0)], [WHITE], 0.3)
-    image = draw_points([(obj, (1, 0.5, 0, 1))])[SIZE // 2, SIZE // 2]
+    image = draw_points(_placed(obj, (1, 0.5, 0, 1)))[SIZE // 2, SIZE // 2]
     assert image == pytest.approx((1, 0.5**2.2, 0, 1), abs=1e-4)
+
+
+def test_instances_of_a_scene_are_points(bpy, lodgs, instance_of):
+    """Blender draws the points of instances in grey, too."""
+    collection = bpy.data.collections.new("scene")
+    bpy.context.scene.collection.children.link(collection)
+    root = bpy.data.objects.new("scene", None)
+    collection.objects.link(root)
+    root.lodgs.is_root = True
+    splats = Splats(
+        means=np.zeros((1, 3)), quats=np.float32([[1, 0, 0, 0]]), log_scales=np.zeros((1, 3)),
+        opacity_logits=np.zeros(1), sh=np.zeros((1, 1, 3)),
+    )  # fmt: skip
+    lodgs("data.scenes").set_level(root, Level(1, splats))
+    level = root.lodgs.levels[0].object
+    carrier = instance_of(lodgs("data.roots").levels_collection(root), (3, 0, 0))
+    window = bpy.context.window_manager.windows[0]
+    space = next(area.spaces.active for area in window.screen.areas if area.type == "VIEW_3D")
+
+    def visible(levels=True):
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        points = lodgs("viewport").visible_points(depsgraph, space, levels)
+        return sorted((obj.name, matrix.translation.x) for obj, matrix, _ in points)
+
+    assert visible() == [(level.name, 0), (level.name, 3)]
+    assert visible(levels=False) == []
+    level.hide_set(True)
+    assert visible() == [(level.name, 3)]
+    carrier.hide_set(True)
+    assert visible() == []
