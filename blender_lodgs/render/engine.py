@@ -75,12 +75,16 @@ class LodgsEngine(bpy.types.RenderEngine):
         window = render_border(depsgraph.scene.render, *size)
         names = self._view_names(depsgraph)
         keys = self._motion_keys(depsgraph, names)
+        last_text = ""
         for index, name in enumerate(names):
             view = self._view(depsgraph, name)
 
             def on_progress(fraction: float, text: str, done: int = index) -> bool:
+                nonlocal last_text
                 self.update_progress((done + fraction) / len(names))
-                self.update_stats("", text)
+                if text != last_text:  # background renders print a line for each update
+                    self.update_stats("", text)
+                    last_text = text
                 return not self.test_break()
 
             motion = [key.of_view(name) for key in keys]

@@ -804,6 +804,26 @@ def test_path_of_a_frame_contains_its_number(bpy, lodgs, pattern, frame, name):
     assert path.name == name and str(path.parent) == pattern.rpartition("/")[0]
 
 
+def test_repeated_progress_prints_no_line(bpy, lodgs, scene):
+    """Blender prints a line for each update of the text."""
+    updates = []
+
+    def wait_for_frame(depsgraph, width, height, window, on_progress, *_):
+        updates.clear()
+        for text in ("Preparing", "Preparing", "Rendering", "Rendering"):
+            on_progress(0.0, text)
+            updates.append(text)
+
+    def on_update(*_):
+        updates.append("update")
+
+    bpy.app.handlers.render_stats.append(on_update)
+    with lodgs("render.engine").use_renderer(wait_for_frame):
+        bpy.ops.render.render()
+    bpy.app.handlers.render_stats.remove(on_update)
+    assert updates[:6] == ["update", "Preparing", "Preparing", "update", "Rendering", "Rendering"]
+
+
 def test_compositor_nodes_of_the_user_are_not_changed(bpy, lodgs, scene):
     tree = lodgs("compat").compositor_tree(scene)
     tree.nodes.new("CompositorNodeBlur")
