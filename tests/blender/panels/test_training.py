@@ -35,7 +35,7 @@ def test_settings_before_training(root, draw, fake):
     layout = draw()
     assert (layout.operators, layout.buttons) == (["lodgs.train", "lodgs.check_scene"], ["Train", ""])
     assert layout.properties == ["method", "preset", "image_scale"]
-    assert "5,560 steps in 5 levels" in layout.texts
+    assert "5,661 steps in 5 levels" in layout.texts
     assert NONE_HELD_OUT in layout.texts
     root.lodgs.training.test_every = 8
     assert NONE_HELD_OUT not in draw().texts

@@ -38,7 +38,7 @@ class FlodParameters(MergedParameters, FlodLevels, DensityParameters):
         unit="px",
     )
     steps: tuple[int, ...] = setting(
-        (250, 400, 500, 750, 3460), "Training steps of each level.", above=0, unit="steps"
+        (250, 400, 500, 750, 3561), "Training steps of each level.", above=0, unit="steps"
     )
     densify_until: tuple[float, ...] = setting(
         (0.5,) * 5, "Fraction of a level's steps in which splats are added and removed.", high=1
