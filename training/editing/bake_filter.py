@@ -104,7 +104,7 @@ def _filter_factor(means: np.ndarray, shapes: np.ndarray, view: Camera) -> np.nd
     right, down, ahead = view.world_to_camera[:3, :3]
     across = (view.fx / z)[:, None] * (right - (x / z)[:, None] * ahead)
     along = (view.fy / z)[:, None] * (down - (y / z)[:, None] * ahead)
-    first, second = ((axis[:, None] @ shapes)[:, 0] for axis in (across, along))
+    first, second = (np.einsum("ni,nij->nj", axis, shapes) for axis in (across, along))
     a, b, c = ((u * v).sum(1) for u, v in ((first, first), (first, second), (second, second)))
     determinant = np.maximum(a * c - b * b, 0)
     return np.sqrt(determinant / ((a + MIP_VARIANCE) * (c + MIP_VARIANCE) - b * b))

@@ -44,7 +44,7 @@ def test_settings_before_training(root, draw, fake):
     assert any("No views are left to train on" in text for text in layout.texts) and not layout.buttons
     root.lodgs.training.test_every = 8
     root.lodgs.training.parameters.levels = 3
-    assert "4,910 steps in 3 levels" in draw().texts
+    assert "5,011 steps in 3 levels" in draw().texts
     root.lodgs.training.method = "3dgs"  # has no levels
     assert "3,000 steps" in draw().texts
 
