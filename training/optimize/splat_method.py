@@ -96,6 +96,11 @@ class SplatMethod(Method[SplatParameters, Drawing]):
             if due(p.opacity_reset_interval, completed) and completed < self._densify_until:
                 reset_opacities(model)  # not at the end: nothing would remove splats that stay faint
         self.add_margins(step)
+        if self._ends_densification(step):  # the number of splats now remains almost the same
+            self.model.sort()
+
+    def _ends_densification(self, step: int) -> bool:
+        return step < self._densify_until <= step + 1
 
     def _densify(self, step: int) -> None:
         """Add splats by the criterion and, if enabled, remove oversized ones."""
@@ -130,10 +135,9 @@ class SplatMethod(Method[SplatParameters, Drawing]):
         require_rows(self.model, step, "least_weight")
 
     def add_margins(self, step: int) -> None:
-        """Add margins if due: when densification ends. The number of splats then remains almost the same."""
-        if step < self._densify_until <= step + 1:
+        """Add margins if due: when densification ends."""
+        if self._ends_densification(step):
             self.model.append(self.margin_rows())
-            self.model.sort()
 
     def margin_rows(self) -> dict[str, torch.Tensor]:
         """Create margin splats within the budget, as rows of the model."""

@@ -219,7 +219,6 @@ class Method(SplatMethod):
             sigma = self.parameters.sigma_init or float(self.sigma.detach().median())
             sigma = torch.full_like(rows["opacity_logits"], sigma)
             self.model.append({**rows, SIGMA: self._encode(sigma)})
-            self.model.sort()
 
     @torch.no_grad()
     def drawn_anywhere(self) -> torch.Tensor:
