@@ -172,7 +172,7 @@ def _draw_train(layout: bpy.types.UILayout, root: bpy.types.Object, resumable: b
         row.operator("lodgs.train", text="Train Again", icon="FILE_REFRESH")
     else:
         row.operator("lodgs.train", text="Train", icon="PLAY")
-    if root.lodgs.scene_folder and not estimate:
+    if not estimate:
         row.operator("lodgs.check_scene", text="", icon="TIME")
     if root.session_uid in scene_check.running:
         say(layout, "Estimating time and memory…", "TIME")

@@ -261,7 +261,7 @@ def follow(
         processes.follow(step)
 
 
-class _Inputs(NamedTuple):
+class TrainingInputs(NamedTuple):
     """Splats to train from, the views to render them from, as (camera, near), and warnings."""
 
     bundle: Bundle
@@ -269,7 +269,7 @@ class _Inputs(NamedTuple):
     warnings: list[str]
 
     @classmethod
-    def of(cls, root: bpy.types.Object, job: Job) -> _Inputs:
+    def of(cls, root: bpy.types.Object, job: Job) -> TrainingInputs:
         """Return the inputs of a job from the current splats of a root."""
         inputs = cls(scenes.read_levels(root), [], [])
         if job.capture:
@@ -296,7 +296,7 @@ def _launch(
     at_once = root.lodgs.training.at_once if job.cells else 1
     environment.require(python, at_once)
     state = run_state(run)
-    inputs = _Inputs.of(root, job) if export else None  # an error leaves no folder
+    inputs = TrainingInputs.of(root, job) if export else None  # an error leaves no folder
     run.create()
     with run.locked():
         if state == "empty" and run.job.exists():

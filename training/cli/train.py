@@ -44,15 +44,14 @@ def check_job(options: argparse.Namespace) -> int:
     if not (options.job and (options.job.is_file() or RunFolder(options.job).job.is_file())):
         vars(options).setdefault("out", "run")  # nothing is written
     job = job_from_options(options)
-    if job.capture:
-        print("Nothing to check: training renders its own views.")
-        return 0
     model, images = job.model_and_images
     scale, exposure = job.image_scale, job.exposure
-    findings = check_folder(Path(job.scene), model, images, image_scale=scale, exposure=exposure)
+    findings = []
+    if not job.capture:  # it renders its own views
+        findings = check_folder(Path(job.scene), model, images, image_scale=scale, exposure=exposure)
     for finding in findings:
         print(f"{finding.severity}: {finding}")
-    if all(finding.severity == INFO for finding in findings):
+    if not job.capture and all(finding.severity == INFO for finding in findings):
         print("Nothing found that lowers the quality.", flush=True)
     if any(finding.severity == ERROR for finding in findings):
         return 2

@@ -20,12 +20,16 @@ from ..optimize.method import Method
 from ..optimize.parameters import Parameters
 from ..optimize.training_data import TrainingData
 from ..rasterize import warm_up
+from ..scenes.cameras import pick_evenly
 from ..scenes.check import ESTIMATE, Finding
 from ..scenes.colmap import Scene, read_scene
 from ..scenes.triangulate import cached_points
+from ..splats.gaussians import SplatRows
 from .backend import choose_backend
+from .base import base_origin, open_base
+from .capture import capture
 from .cells.plan import PROGRAM_BYTES, SPLAT_BYTES, choose_cells
-from .job import Job
+from .job import AUTO, DOME, Job
 
 ASSUMED_SPLATS = 1_000_000
 """Assumed number of splats of a run without a limit."""
@@ -37,6 +41,8 @@ ROUND_GROWTH = 0.1
 """Splats that a densification adds, as a share of the initial points. Measured: 0.04 to 0.25."""
 GROWTH_SHARE = 0.5
 """Share of the steps in which the number of splats grows, if the finest level is trained first."""
+SAMPLE_VIEWS = 6
+"""Number of views to render of splats without photos."""
 MAX_USE = 0.8
 """Share of the free memory or disk that a training may use."""
 LONG_SECONDS = 2 * 3600
@@ -83,8 +89,8 @@ def estimate_findings(job: Job) -> list[Finding]:
 
     Takes some seconds, and up to a minute more if the kernels are not compiled yet.
     """
-    if job.base or job.cells or job.region:
-        return [Finding(ESTIMATE, "There is no estimate for training from splats, in cells or of a region.")]
+    if job.cells or job.region:
+        return [Finding(ESTIMATE, "There is no estimate for training in cells or of a region.")]
     try:
         with tempfile.TemporaryDirectory(prefix="lodgs-") as scratch:
             costs = estimate(job, Path(scratch))
@@ -94,48 +100,83 @@ def estimate_findings(job: Job) -> list[Finding]:
 
 
 def estimate(job: Job, scratch: Path) -> Estimate:
-    """Estimate a job on photos by real steps with the initial and the final number of splats.
+    """Estimate a job by real steps with the initial and the final number of splats.
+
+    A job that starts from splats has about the same number in all steps. Without photos, a few of its views
+    are rendered.
 
     Args:
-        scratch: folder for files of methods with splats on disk.
+        scratch: folder for rendered views, and for files of methods with splats on disk.
 
     Raises:
-        LodgsError: the scene cannot be read or trained, or has no points yet.
+        LodgsError: the scene or the base cannot be read or trained, or the scene has no points yet.
     """
     begin = time.monotonic()
     job = job.resolved()
     parameters = job.resolved_parameters()
+    base = None
+    if job.base:
+        base, antialias = open_base(job.base)
+        base = base if METHODS[job.method].streams_base else base.select(slice(None))
+        parameters = replace(parameters, antialias=antialias)
     model, images = job.model_and_images
-    scene = cached_points(read_scene(Path(job.scene), model, images), job.exposure)
+    folder, views, rendering = _render_views(job, scratch) if job.capture else (Path(job.scene), 0, 0.0)
+    scene = cached_points(read_scene(folder, model, images, origin=base_origin(job)), job.exposure)
     if not len(scene.points):
         raise LodgsError("the scene has no points yet.", "Training makes them first.")
     backend = choose_backend(job, scene)
     torch.set_num_threads(1)  # as in training
     warm_up(backend)
     start = START_SECONDS + time.monotonic() - begin
-    splats = _expected_splats(parameters, len(scene.points))
-    early, _, _ = _measure(job, parameters, scene, backend, scratch, last=False)
-    if backend == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-    reset_peak_memory()
-    grown = _with_points(scene, max(splats, MIN_POINTS))
-    all_points = replace(parameters, margin=0.0)  # margins are among the final splats
-    late, growing, data = _measure(job, all_points, grown, backend, scratch, last=True)
+    splats = _expected_splats(parameters, len(scene.points)) if base is None else len(base)
+    early, _, data = _measure(job, parameters, scene, backend, scratch, base, last=False)
+    late, growing = early, 1.0
+    if base is None:
+        if backend == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        reset_peak_memory()
+        grown = _with_points(scene, max(splats, MIN_POINTS))
+        all_points = replace(parameters, margin=0.0)  # margins are among the final splats
+        late, growing, data = _measure(job, all_points, grown, backend, scratch, None, last=True)
     width, height = data.train[0].width, data.train[0].height
+    views = views or len(data.train)
     photos = sum(TARGET_BYTES * camera.width * camera.height for camera in data.train)
+    photos = round(photos * views / len(data.train))
     photos = max(min(photos, job.photo_memory * 10**6 or MAX_BYTES) - data.images.held_bytes, 0)
     if backend == "cuda":
         memory, available = torch.cuda.max_memory_allocated(), torch.cuda.mem_get_info()[0]
     else:
         memory = (peak_memory() or round(PROGRAM_BYTES + SPLAT_BYTES * splats)) + photos
         available = free_memory()
-    steps = parameters.for_photos(len(data.train)).total_steps
+    planned = parameters.for_photos(views)
+    steps = planned.total_steps if base is None else planned.base_steps
     growth = max(growing, GROWTH_SHARE)
-    seconds = start + steps * (growth * (early + late) / 2 + (1 - growth) * late)
+    seconds = start + rendering + steps * (growth * (early + late) / 2 + (1 - growth) * late)
     return Estimate(
         seconds, memory, available, _disk_bytes(parameters, splats), _free_disk(Path(job.out)), splats, steps,
-        len(data.train), (width, height),
+        views, (width, height),
     )  # fmt: skip
+
+
+def _render_views(job: Job, scratch: Path) -> tuple[Path, int, float]:
+    """Render some of the views of a job without photos.
+
+    Returns:
+        The folder of the scene, the number of all views, and the seconds to render the others.
+    """
+    source, count = job.capture, job.views
+    if source not in (AUTO, DOME):
+        files = sorted(Path(source).glob("*.json"))
+        count, source = len(files), str(scratch / "cameras")
+        Path(source).mkdir()
+        for file in pick_evenly(files, SAMPLE_VIEWS):
+            shutil.copy2(file, source)
+    times: list[float] = []
+    rendered, _ = capture(
+        job.base, scratch / "captured", source, min(count, SAMPLE_VIEWS), job.view_width, backend=job.backend,
+        report=lambda number, total: times.append(time.monotonic()),
+    )  # fmt: skip
+    return scratch / "captured", count, max(count - rendered, 0) * float(np.median(np.diff(times)))
 
 
 def suggest_settings(job: Job, costs: Estimate) -> list[Finding]:
@@ -182,12 +223,20 @@ def _expected_splats(parameters: Parameters, points: int) -> int:
 
 
 def _measure(
-    job: Job, parameters: Parameters, scene: Scene, backend: str, scratch: Path, *, last: bool
+    job: Job,
+    parameters: Parameters,
+    scene: Scene,
+    backend: str,
+    scratch: Path,
+    base: SplatRows | None,
+    *,
+    last: bool,
 ) -> tuple[float, float, TrainingData]:
     """Return the median seconds of a step from the points of a scene, the share of steps before the finest
     level, and the data.
 
     Args:
+        base: splats to start from, instead of the points.
         last: measure the last steps of the finest level, else the first steps.
     """
     data = TrainingData(
@@ -195,7 +244,7 @@ def _measure(
         photo_memory=job.photo_memory * 10**6 or None, splat_memory=job.splat_memory * 10**6 or None,
         scratch=scratch,
     )  # fmt: skip
-    method = create(job.method, data, parameters, job.seed, backend, None)
+    method = create(job.method, data, parameters, job.seed, backend, base)
     begin, end = _finest_stage(method)
     try:
         first = max(end - 50, begin) if last else 0

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -248,6 +249,34 @@ def test_estimate_is_above_train_until_settings_change(bpy, lodgs, root, draw_pa
         setattr(root.lodgs.training, name, restored)
         assert "About 3 min." in draw_training().texts
     lodgs("extension").preferences().backend = "cpu"  # the time depends on the device
+    assert "About 3 min." not in draw_training().texts
+
+
+def test_splats_without_photos_have_an_estimate(bpy, lodgs, draw_panel, monkeypatch, tmp_path):
+    """The trainer gets the splats and the views, which are removed afterwards."""
+    folders = []
+
+    def answer(python, command, file, *_, **options):
+        job = lodgs("training.runs.job").Job.from_file(Path(file))
+        assert len(lodgs("training.splats.bundle").read_bundle(job.base).levels[-1].splats) == 9
+        assert len(list(Path(job.capture).glob("*.json"))) == 4
+        folders.append(Path(file).parent)
+        return SimpleNamespace(returncode=0, stdout="estimate: About 3 min.\n")
+
+    monkeypatch.setattr(lodgs("runs.environment"), "run_module", answer)
+    monkeypatch.setattr(lodgs("runs.environment"), "trainer_python", lambda: Path("python"))
+    opaque = replace(splats(9), opacity_logits=np.full(9, 4, np.float32))
+    write_bundle(tmp_path / "b.ply", Bundle("", [Level(1, opaque)]))
+    root = lodgs("data.importing").import_splats(bpy.context, tmp_path / "b.ply")
+    bpy.ops.curve.primitive_bezier_circle_add(radius=5)
+    settings = root.lodgs.training
+    settings.views_from, settings.views, settings.curve = "CURVE", 4, bpy.context.object
+    bpy.context.view_layer.objects.active = root
+    draw_training = partial(draw_panel, "training", "LODGS_PT_training")
+    assert "lodgs.check_scene" in draw_training().operators
+    assert bpy.ops.lodgs.check_scene() == {"FINISHED"}
+    assert "About 3 min." in draw_training().texts and not folders[0].exists()
+    settings.views = 5
     assert "About 3 min." not in draw_training().texts
 
 

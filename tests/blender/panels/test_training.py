@@ -70,7 +70,7 @@ def test_splats_without_photos_need_settings_of_views(bpy, lodgs, root, draw, fa
     settings.method = "lodge"
     first = ["method", "preset", "image_scale", "views_from"]
     assert draw().properties == [*first, "views", "view_width", "show_views"]
-    assert draw().operators == ["lodgs.train"]
+    assert draw().operators == ["lodgs.train", "lodgs.check_scene"]
     assert any("opaque splat" in text for text in draw().texts)
     assert "1,200 steps in 3 levels" in draw().texts  # the finest level takes no steps
     settings.views_from = "CURVE"

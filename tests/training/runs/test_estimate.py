@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 
 from tests.training.conftest import write_tiny_scene
+from training.optimize.initialize import from_points, to_splats
 from training.runs import estimate as module
+from training.runs.capture import capture
 from training.runs.estimate import Estimate, estimate, estimate_findings, suggest_settings
 from training.runs.job import Job
+from training.scenes.cameras import write_camera
 from training.scenes.colmap import read_scene
+from training.scenes.viewpoints import opaque_means, surrounding_views
+from training.splats.gaussians import Splats
+from training.splats.ply import read_ply, write_ply
 
 COSTS = Estimate(600, 10**9, 8 * 10**9, 10**9, 50 * 10**9, 60_000, 1000, 42, (960, 640))
 
@@ -118,6 +124,70 @@ def test_scenes_without_points_have_no_estimate(job):
     Path(job.scene, "sparse", "0", "points3D.txt").write_text("")
     (finding,) = estimate_findings(job)
     assert str(finding) == "No estimate: the scene has no points yet. Training makes them first."
+
+
+@pytest.fixture
+def ball(tmp_path):
+    """Return the file of 300 opaque splats on a sphere."""
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(300, 3))
+    means = 2 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    splats = Splats(
+        means.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
+        np.full((300, 3), np.log(0.2), np.float32), np.full(300, 4.0, np.float32),
+        np.zeros((300, 1, 3), np.float32),
+    )  # fmt: skip
+    write_ply(tmp_path / "ball.ply", splats)
+    return tmp_path / "ball.ply"
+
+
+def test_training_without_photos_has_an_estimate_from_some_of_its_views(job, ball, tmp_path, monkeypatch):
+    """40 steps of 0.2 s, and 14 more views of 0.5 s each: the clock advances at each view."""
+    monkeypatch.setattr(module, "_time_steps", lambda method, first, end: 0.2)
+    rendered, clock = [], iter(np.arange(0, 100, 0.5))
+
+    def render(base, scene, source, views, width, *, backend, report):
+        rendered.append((source, views, width))
+        with monkeypatch.context() as patch:
+            patch.setattr(module.time, "monotonic", lambda: next(clock))
+            return capture(base, scene, source, views, width, backend=backend, report=report)
+
+    monkeypatch.setattr(module, "capture", render)
+    parameters = {"levels": 3, "tune_steps": 10, "levels_from": "merged"}
+    job = replace(
+        job, scene="", method="lodge", base=str(ball), capture="dome", views=20, view_width=48,
+        parameters=parameters,
+    )  # fmt: skip
+    costs = estimate(job, tmp_path)
+    assert rendered == [("dome", module.SAMPLE_VIEWS, 48)]
+    assert (costs.splats, costs.views, costs.size) == (300, 20, (48, 32))
+    assert costs.steps == job.resolved().resolved_parameters().base_steps
+    expected = 0.2 * costs.steps + 14 * 0.5
+    assert module.START_SECONDS < costs.seconds - expected < module.START_SECONDS + 60
+
+
+def test_estimate_renders_some_of_the_views_of_a_folder(job, ball, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_time_steps", lambda method, first, end: 0.2)
+    cameras, near = surrounding_views(opaque_means(read_ply(ball)), 9, 48, 32)
+    (tmp_path / "views").mkdir()
+    for number, camera in enumerate(cameras):
+        write_camera(tmp_path / "views" / f"{number}.json", camera, near)
+    job = replace(
+        job, scene="", base=str(ball), capture=str(tmp_path / "views"), method="3dgs", parameters={}
+    )
+    assert estimate(job, tmp_path).views == 9
+    assert len(list((tmp_path / "cameras").glob("*.json"))) == module.SAMPLE_VIEWS
+
+
+def test_training_of_photos_from_splats_has_an_estimate(job, tmp_path, monkeypatch):
+    counts = []
+    monkeypatch.setattr(module, "_time_steps", lambda method, *_: counts.append(method.splats) or 0.1)
+    scene = read_scene(Path(job.scene))
+    base = to_splats(from_points(scene.points, scene.point_colors, 0))
+    write_ply(tmp_path / "base.ply", base)
+    job = replace(job, method="3dgs", base=str(tmp_path / "base.ply"), parameters={"steps": 40})
+    costs = estimate(job, tmp_path)
+    assert counts == [len(base)] and costs.splats == len(base) and costs.steps == 40
 
 
 def test_cells_have_no_estimate(job):
