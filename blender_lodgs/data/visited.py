@@ -87,8 +87,10 @@ def count(scene: bpy.types.Scene) -> int:
 
 
 def clear() -> None:
-    """Forget all views."""
+    """Forget all views, also one that has not rested yet."""
     global _pending
+    if bpy.app.timers.is_registered(_record_at_rest):
+        bpy.app.timers.unregister(_record_at_rest)
     _pending = None
     _visits.clear()
     _matrices.clear()

@@ -76,6 +76,13 @@ def test_the_oldest_views_are_dropped(bpy, visited, visit, monkeypatch):
     assert [camera.center[2] for camera in views] == pytest.approx([6, 8, 10], abs=1e-5)
 
 
+def test_no_timer_remains_without_the_extension(bpy, visited, visit):
+    visit((0, 0, 2), rests=False)
+    assert bpy.app.timers.is_registered(visited._record_at_rest)
+    visited.clear()  # as unregistering does
+    assert not bpy.app.timers.is_registered(visited._record_at_rest)
+
+
 def test_training_views_are_in_the_coordinates_of_the_splats(bpy, lodgs, visit):
     with lodgs("data.importing").new_scene(bpy.context, "scene") as root:
         pass
