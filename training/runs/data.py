@@ -85,7 +85,7 @@ def training_data(
     if pixels and parameters.depth_weight:
         depths = DepthPriors(scene, parameters.depth)
         scene = replace(scene, warnings=[*scene.warnings, *depths.warnings])
-    if pixels and parameters.match_exposure:
+    if pixels and parameters.match_exposure and not job.capture:  # renders have one exposure
         gains = _match_exposure(job, scene, full_scene, report)
     if job.crop is not None:
         scene = thin_outside_region(scene, job.crop, int(OUTSIDE_SHARE * parameters.splat_limit))

@@ -57,12 +57,13 @@ class Estimate:
     """Expected costs of a training.
 
     Attributes:
-        seconds: duration.
+        seconds: duration; from splats without the time between levels, so at least this.
         memory, free_memory: bytes at the peak, and those available now; of the GPU if it has its own.
         disk, free_disk: bytes of the run folder at the peak, with checkpoints, and those available there.
         splats: expected number of splats of the finest level.
         steps, views: number of steps and training views.
         size: width and height of a training image in pixels.
+        from_splats: the training starts from splats.
     """
 
     seconds: float
@@ -74,11 +75,13 @@ class Estimate:
     steps: int
     views: int
     size: tuple[int, int]
+    from_splats: bool = False
 
     def __str__(self) -> str:
         splats = f"{float(f'{self.splats:.2g}'):,.0f}"
+        duration = f"{'At least' if self.from_splats else 'About'} {format_duration(self.seconds)}"
         return (
-            f"About {format_duration(self.seconds)}, {self.memory / 1e9:.1f} of {self.free_memory / 1e9:.1f} "
+            f"{duration}, {self.memory / 1e9:.1f} of {self.free_memory / 1e9:.1f} "
             f"GB memory, {self.disk / 1e9:.1f} of {self.free_disk / 1e9:.1f} GB disk, about {splats} "
             f"splats ({self.steps:,} steps on {self.views} views of {self.size[0]}x{self.size[1]} pixels)."
         )
@@ -154,7 +157,7 @@ def estimate(job: Job, scratch: Path) -> Estimate:
     seconds = start + rendering + steps * (growth * (early + late) / 2 + (1 - growth) * late)
     return Estimate(
         seconds, memory, available, _disk_bytes(parameters, splats), _free_disk(Path(job.out)), splats, steps,
-        views, (width, height),
+        views, (width, height), base is not None,
     )  # fmt: skip
 
 

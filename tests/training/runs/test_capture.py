@@ -202,6 +202,21 @@ def test_damaged_captured_views_are_rendered_again(ball, tmp_path, damaged):
     assert reports[0].startswith("warning: ") and "damaged. They are rendered again" in reports[0]
 
 
+def test_exposures_of_renders_are_not_compared(ball, tmp_path, monkeypatch):
+    """They are equal; colours that depend on the view would look like differences."""
+    compared = []
+    monkeypatch.setattr("training.runs.data.exposure_gains", lambda *_: compared.append(1) or {})
+    run = RunFolder(tmp_path / "run")
+    run.create()
+    write_ply(run.base, ball)
+    keys = {"scene": "", "base": str(run.base), "out": str(run.path), "method": "lodge", "capture": "dome"}
+    training_data(Job.from_dict({**keys, "views": 4, "view_width": 48, "image_scale": 1.0}), run)
+    assert not compared
+    photos = RunFolder(tmp_path / "photos")
+    training_data(Job(str(run.captured), str(photos.path), image_scale=1.0), photos)
+    assert compared
+
+
 def test_views_along_a_path_are_level_and_look_in_all_directions(ball):
     path = np.array([[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 0.6, 9]], float)  # -y is up: it descends slightly
     views, near = walk_views(ball, path, np.array([0.0, -2, 0]), 24, 96, 64)

@@ -162,6 +162,7 @@ def test_training_without_photos_has_an_estimate_from_some_of_its_views(job, bal
     assert rendered == [("dome", module.SAMPLE_VIEWS, 48)]
     assert (costs.splats, costs.views, costs.size) == (300, 20, (48, 32))
     assert costs.steps == job.resolved().resolved_parameters().base_steps
+    assert str(costs).startswith("At least ")
     expected = 0.2 * costs.steps + 14 * 0.5
     assert module.START_SECONDS < costs.seconds - expected < module.START_SECONDS + 60
 
