@@ -19,7 +19,7 @@ class ViewPattern(NamedTuple):
 
     Attributes:
         identifier, label, about: entry of the enum ``ViewsSettings.views_from``.
-        option: name of its option on the command line, or "": there are no viewports.
+        option: name of its option on the command line; "" if the pattern needs viewports.
         setting: property of ``ViewsSettings`` for this pattern only, or "".
     """
 

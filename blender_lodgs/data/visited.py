@@ -14,8 +14,8 @@ REST = 0.5
 MAX_VIEWS = 256
 """Maximum number of views of a Blender scene; the oldest are dropped."""
 DISTANCE, COSINE = 0.1, 0.966
-"""A view is new if its distance from all others is this share of that to its orbit point, or if it is turned
-by more than 15°."""
+"""A view is new if its distance from each recorded view is at least this share of its distance from its orbit
+point, or if it is turned by more than 15° (cosine) from that view."""
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 _matrices: dict[int, np.ndarray] = {}
@@ -63,6 +63,7 @@ def _record_at_rest() -> float | None:
 
 
 def _resembles(first: Camera, second: Camera, distance: float) -> bool:
+    """Return True if two views are closer than a distance and look in almost the same direction."""
     turned = first.world_to_camera[2, :3] @ second.world_to_camera[2, :3] < COSINE
     return not turned and float(np.linalg.norm(first.center - second.center)) < distance
 
