@@ -13,6 +13,7 @@ from training import methods
 from training.errors import LodgsError
 from training.evaluate.metrics import psnr
 from training.optimize.method import Method
+from training.optimize.parameters import override
 from training.rasterize import Gaussians, rasterize
 from training.runs import train as training_loop
 from training.runs.base import read_base
@@ -25,6 +26,7 @@ from training.scenes.images import load_image
 from training.splats.bundle import read_bundle, write_bundle
 from training.splats.gaussians import Splats
 from training.splats.levels import Bundle, Level
+from training.splats.morton import spatial_order
 from training.splats.ply import write_ply
 
 ABOUT = """
@@ -289,3 +291,17 @@ def test_step_has_random_background_and_image_has_none(data, name):
     assert len(colors) == 9 and black.background(3) == (0, 0, 0) == tuple(
         create(name, data, presets["paper"], 0, "cpu").background(3)
     )
+
+
+@pytest.mark.parametrize("name", ["3dgs", "flod", "clod"])
+def test_splats_are_in_spatial_order_once_densification_ends(data, name):
+    values = {"densify_until": 0.5, "steps": 8}
+    if name == "flod":
+        values = {"levels": 1, "densify_until": [0.5], "densify_interval": [50], "steps": [8]}
+    method = methods.create(name, data, override(methods.METHODS[name].presets["draft"], values), 0, "cpu")
+    orders = []
+    for step in range(4):
+        method.train_step(step)
+        orders.append(spatial_order(method.model["means"].detach().numpy()).tolist())
+    rows = list(range(len(orders[-1])))
+    assert orders[-1] == rows and orders[0] != rows
